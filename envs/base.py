@@ -1,0 +1,54 @@
+"""The contract every task keeps: `Env`, a pair of pure unbatched functions on a `State` of arrays."""
+
+import abc
+from typing import Any
+
+import numpy as np
+from flax import struct
+from jax import Array
+from jaxtyping import Float, Key
+
+
+class PhysicsState(struct.PyTreeNode):
+    """The whole memory of a MuJoCo simulation between two ticks."""
+
+    qpos: Array  # [nq] generalised positions
+    qvel: Array  # [nv] generalised velocities
+    qacc_warmstart: Array  # [nv] accelerations from which the constraint solver starts
+
+
+class State(struct.PyTreeNode):
+    """What a task hands over at every tick; `reset` and `step` give the same structure, shapes and dtypes."""
+
+    physics: Any  # the task's own small pytree, e.g. `PhysicsState`
+    obs: Array  # [S] float32
+    reward: Array  # [] float32, earned by the tick just made
+    terminated: Array  # [] bool, the task ended
+    truncated: Array  # [] bool, the time limit cut it
+    metrics: dict[str, Array]  # [] float32 each: reward terms, distance to goal, success
+    tick: Array | None = None  # [] int32, ticks since reset (`TimeLimit`)
+    key: Array | None = None  # typed PRNG key of the resets to come (`AutoReset`)
+    final_obs: Array | None = None  # [S], obs before a reset; equals obs where none happened (`AutoReset`)
+
+
+class Env(abc.ABC):
+    """A task: unbatched and pure, so the caller applies `jax.vmap` and `jax.jit`."""
+
+    name: str
+    observation_size: int
+    action_size: int
+    proprioceptive_size: int  # the leading entries of obs that describe the body alone
+    episode_length: int  # ticks
+    dt: float  # seconds a tick
+
+    @abc.abstractmethod
+    def reset(self, key: Key[Array, ""]) -> State:
+        """Draw the first state of an episode; consumes the key."""
+
+    @abc.abstractmethod
+    def step(self, state: State, action: Float[Array, " A"]) -> State:
+        """Advance by one tick under an action in [-1, 1]^A, which the caller has clipped."""
+
+    @abc.abstractmethod
+    def render(self, physics: Any, *, height: int = 240, width: int = 320) -> np.ndarray:
+        """Draw a trajectory of `State.physics` with leading axis T as frames [T, height, width, 3] uint8."""

@@ -1,0 +1,128 @@
+"""Navigation of a point in a room of 10 m by 10 m with rectangular obstacles."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array
+from jaxtyping import Bool, Float, Key
+
+from taic_jax.envs.base import Env, State
+
+ROOM = 10.0  # m, side of the room
+MAX_SPEED = 1.0  # m/s on each axis
+GOAL_RADIUS = 0.5  # m
+CELL = 0.1  # m, raster from which free points are drawn
+START, GOAL = (1.0, 5.0), (9.0, 5.0)  # m, of the task with fixed ends
+
+# Rectangles (x_low, y_low, x_high, y_high) in m: a wall with gaps at y in [4, 6] and [8.5, 10], and two blocks.
+# Walls are thicker than the 0.2 m of a tick, so nothing tunnels.
+BASE_MAP = np.array(
+    [[4.8, 0.0, 5.2, 4.0], [4.8, 6.0, 5.2, 8.5], [2.0, 2.0, 3.0, 3.5], [7.0, 8.0, 8.0, 8.6]], np.float32
+)
+
+
+class NavigationState(struct.PyTreeNode):
+    """Where the point is, and where it shall go."""
+
+    position: Array  # [2] m
+    goal: Array  # [2] m
+
+
+class Navigation(Env):
+    """Reach the goal: reward +100 there, which ends the episode, and -1 at every other tick.
+
+    The action is the velocity; a move along one axis that would end inside an obstacle is cancelled, so the point
+    slides along walls. Observation: position / 5 - 1, and the goal alike where it varies.
+
+    Args:
+      walls: rectangles [R, 4] in m; a traced array will do, so a program can change the map without recompiling.
+      random_ends: draw start and goal uniformly from free space each episode, and observe the goal.
+    """
+
+    action_size = 2
+    proprioceptive_size = 2
+    episode_length = 200
+    dt = 0.2
+
+    def __init__(self, walls: Float[Array | np.ndarray, "R 4"] = BASE_MAP, random_ends: bool = False):
+        self.name = "nav2d_random" if random_ends else "nav2d"
+        self.observation_size = 4 if random_ends else 2
+        self.random_ends = random_ends
+        self.walls = jnp.asarray(walls)
+        self._cells, self._num_cells = free_cells(self.walls)
+
+    def reset(self, key: Key[Array, ""]) -> State:
+        """Put the point on its start."""
+        position, goal = jnp.array(START), jnp.array(GOAL)
+        if self.random_ends:
+            key_start, key_goal = jax.random.split(key)
+            position, goal = self._draw_free(key_start), self._draw_free(key_goal)
+        physics = NavigationState(position=position, goal=goal)
+        no = jnp.zeros((), bool)
+        metrics = {"distance_to_goal": jnp.linalg.norm(goal - position), "success": jnp.zeros(())}
+        return State(
+            physics=physics,
+            obs=self._observe(physics),
+            reward=jnp.zeros(()),
+            terminated=no,
+            truncated=no,
+            metrics=metrics,
+        )
+
+    def step(self, state: State, action: Float[Array, " 2"]) -> State:
+        """Move by one tick, first along x, then along y."""
+        x, y = state.physics.position
+        new_x, new_y = jnp.clip(state.physics.position + MAX_SPEED * self.dt * action, 0.0, ROOM)
+        x = jnp.where(inside(jnp.stack([new_x, y]), self.walls), x, new_x)
+        y = jnp.where(inside(jnp.stack([x, new_y]), self.walls), y, new_y)
+        physics = state.physics.replace(position=jnp.stack([x, y]))
+        distance = jnp.linalg.norm(physics.goal - physics.position)
+        success = distance <= GOAL_RADIUS
+        return state.replace(
+            physics=physics,
+            obs=self._observe(physics),
+            reward=jnp.where(success, jnp.float32(100.0), jnp.float32(-1.0)),
+            terminated=success,
+            truncated=jnp.zeros((), bool),
+            metrics={"distance_to_goal": distance, "success": success.astype(jnp.float32)},
+        )
+
+    def render(self, physics: NavigationState, *, height: int = 240, width: int = 320) -> np.ndarray:
+        """Draw room, obstacles, start, goal and the path so far."""
+        from taic_jax.envs.rendering import render_room
+
+        return render_room(
+            np.asarray(self.walls),
+            physics.position,
+            physics.goal,
+            size=ROOM,
+            goal_radius=GOAL_RADIUS,
+            longest_move=1.01 * MAX_SPEED * self.dt,
+            height=height,
+            width=width,
+        )
+
+    def _observe(self, physics: NavigationState) -> Float[Array, " S"]:
+        points = [physics.position, physics.goal] if self.random_ends else [physics.position]
+        return jnp.concatenate(points) / (ROOM / 2) - 1.0
+
+    def _draw_free(self, key: Key[Array, ""]) -> Float[Array, " 2"]:
+        """Draw a point uniformly from the free cells: a cell, then a place in it (no loop of rejections)."""
+        key_cell, key_place = jax.random.split(key)
+        cell = self._cells[jax.random.randint(key_cell, (), 0, self._num_cells)]
+        return cell + jax.random.uniform(key_place, (2,), maxval=CELL)
+
+
+def inside(point: Float[Array, " 2"], walls: Float[Array, "R 4"]) -> Bool[Array, ""]:
+    """Tell whether a point lies in any of the rectangles; their edges belong to them."""
+    return jnp.any(jnp.all((walls[:, :2] <= point[None]) & (point[None] <= walls[:, 2:]), axis=1))
+
+
+def free_cells(walls: Float[Array, "R 4"]) -> tuple[Float[Array, "M 2"], Array]:
+    """Raster the room and list the lower corners of the M' <= M cells that touch no rectangle first, with M'."""
+    axis = jnp.arange(0.0, ROOM, CELL)
+    corners = jnp.stack(jnp.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
+    low, high = walls[None, :, :2], walls[None, :, 2:]
+    touches = jnp.any(jnp.all((corners[:, None] <= high) & (low <= corners[:, None] + CELL), axis=2), axis=1)
+    return corners[jnp.argsort(touches, stable=True)], jnp.sum(~touches)

@@ -1,0 +1,30 @@
+"""The one place that deals with what MJX and Brax do and this project does not: loose promotion and idle notes."""
+
+import contextlib
+import warnings
+from collections.abc import Iterator
+
+import jax
+
+_NOTES = (
+    "Brax System, piplines and environments are not actively being maintained",
+    "JAXopt is no longer maintained",
+    "Accessing `[a-z]*` directly from `Data` is deprecated",  # Brax's own use of MJX
+)
+
+
+@contextlib.contextmanager
+def third_party() -> Iterator[None]:
+    """Import or call MJX or Brax: promote dtypes and ranks as JAX does by default, and hide notes not for users.
+
+    MJX prints at its import that the optional Warp is not installed; that is why standard output is closed.
+    """
+    with (
+        jax.numpy_dtype_promotion("standard"),
+        jax.numpy_rank_promotion("allow"),
+        contextlib.redirect_stdout(None),
+        warnings.catch_warnings(),
+    ):
+        for note in _NOTES:
+            warnings.filterwarnings("ignore", note)
+        yield

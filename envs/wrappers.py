@@ -1,0 +1,101 @@
+"""Time limit and automatic reset, kept apart from the tasks' own dynamics."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Float, Key
+
+from taic_jax.envs.base import Env, State
+
+
+class Wrapper(Env):
+    """An environment around another; whatever it does not define is the inner one's."""
+
+    def __init__(self, env: Env):
+        self.env = env
+
+    def __getattr__(self, name: str) -> Any:
+        if name == "env":  # not yet set, as while unpickling
+            raise AttributeError(name)
+        return getattr(self.env, name)
+
+    def reset(self, key: Key[Array, ""]) -> State:
+        """Reset the inner environment."""
+        return self.env.reset(key)
+
+    def step(self, state: State, action: Float[Array, " A"]) -> State:
+        """Step the inner environment."""
+        return self.env.step(state, action)
+
+    def render(self, physics: Any, *, height: int = 240, width: int = 320) -> np.ndarray:
+        """Render with the inner environment."""
+        return self.env.render(physics, height=height, width=width)
+
+
+class TimeLimit(Wrapper):
+    """Set `truncated` at the last allowed tick; the task's own end at that very tick stays `terminated` too."""
+
+    def __init__(self, env: Env, ticks: int):
+        super().__init__(env)
+        self.episode_length = ticks
+
+    def reset(self, key: Key[Array, ""]) -> State:
+        """Reset with the count of ticks at zero."""
+        return self.env.reset(key).replace(tick=jnp.zeros((), jnp.int32))
+
+    def step(self, state: State, action: Float[Array, " A"]) -> State:
+        """Step and count the tick."""
+        tick = state.tick + 1
+        state = self.env.step(state, action)
+        return state.replace(tick=tick, truncated=state.truncated | (tick >= self.episode_length))
+
+
+class AutoReset(Wrapper):
+    """Start the next episode, from a fresh key, in the tick that ends one.
+
+    That tick's reward, terminated, truncated and metrics are kept, and the observation it ended in is `final_obs`;
+    physics, obs and tick are already the next episode's. Ticks in which no episode of the whole batch ends compute
+    no reset, under any nesting of vmap.
+    """
+
+    def __init__(self, env: Env):
+        super().__init__(env)
+        self._restart = jax.custom_batching.custom_vmap(self._restart_ended)
+        self._restart.def_vmap(self._restart_batched)
+
+    def reset(self, key: Key[Array, ""]) -> State:
+        """Reset and keep a key for the episodes to come."""
+        key, key_reset = jax.random.split(key)
+        state = self.env.reset(key_reset)
+        return state.replace(key=key, final_obs=state.obs)
+
+    def step(self, state: State, action: Float[Array, " A"]) -> State:
+        """Step, then reset where the episode ended."""
+        key, key_reset = jax.random.split(state.key)
+        state = self.env.step(state, action)
+        running = (state.physics, state.obs, state.tick)
+        physics, obs, tick = self._restart(state.terminated | state.truncated, key_reset, running)
+        return state.replace(physics=physics, obs=obs, tick=tick, key=key, final_obs=state.obs)
+
+    def _restart_ended(self, ended: Array, key: Array, running: Any) -> Any:
+        """Replace what runs by a fresh start where it ended; all arguments have the leading axes of `ended`."""
+
+        def restart(ended: Array, key: Array, running: Any) -> Any:
+            start = self.env.reset(key)
+            start = (start.physics, start.obs, start.tick)
+            return jax.tree.map(lambda new, old: jnp.where(ended, new, old), start, running)
+
+        for _ in range(ended.ndim):
+            restart = jax.vmap(restart)
+        return jax.lax.cond(jnp.any(ended), restart, lambda ended, key, running: running, ended, key, running)
+
+    def _restart_batched(self, axis_size: int, batched: Any, *args: Any) -> tuple[Any, Any]:
+        """Under vmap, ask once for the whole batch: a plain vmap would turn the condition into a select."""
+        args = jax.tree.map(
+            lambda x, has_axis: x if has_axis else jnp.broadcast_to(x, (axis_size, *x.shape)), args, tuple(batched)
+        )
+        running = self._restart(*args)
+        return running, jax.tree.map(lambda _: True, running)

@@ -1,0 +1,217 @@
+"""Configuration of an experiment: frozen, typed and closed; one dataclass per stage.
+
+Every `float` field is a leaf: it may be swept and vmapped without compiling again. Every other field is
+static: it sets shapes or code paths. This module imports no JAX, so that the command line answers at once.
+"""
+
+import dataclasses
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Literal
+
+
+class ConfigError(ValueError):
+    """A mistake in a configuration, told in one line."""
+
+
+@dataclass(frozen=True)
+class EnvConfig:
+    """The environment and the engine that runs its physics."""
+
+    name: str = "nav2d"
+    """Environment: nav2d, nav2d_random, half_cheetah, ant, or brax:NAME for one of Brax's own."""
+    backend: Literal["auto", "mujoco", "mjx"] = "auto"
+    """Physics engine; auto takes mujoco (C, all cores) on CPU and mjx (JAX) elsewhere."""
+    num_threads: int = 0
+    """Threads of the mujoco backend; 0 takes the physical cores."""
+    pipeline: str = "spring"
+    """Physics pipeline of the brax:NAME environments."""
+
+
+@dataclass(frozen=True)
+class PPOConfig:
+    """Proximal policy optimisation over decisions, with semi-Markov advantages (eq. 11-13)."""
+
+    num_envs: int = 16
+    """Environments that run side by side."""
+    rollout_length: int = 512
+    """Ticks per environment between two updates."""
+    epochs: int = 10
+    """Passes over the decisions of one rollout."""
+    minibatch_size: int = 128
+    """Decisions per gradient step."""
+    hidden_sizes: tuple[int, ...] = (64, 64)
+    """Widths of the hidden layers of actor and critic."""
+    learning_rate: float = 3e-4
+    """Step size of Adam."""
+    learning_rate_decay: bool = True
+    """Let the step size fall linearly to zero over the stage."""
+    gamma: float = 0.99
+    """Discount per tick."""
+    lambda_: float = 0.95
+    """Decay of the advantage estimate per decision."""
+    clip: float = 0.2
+    """Half-width of the interval that clips the probability ratio."""
+    value_weight: float = 0.5
+    """Weight of the critic's loss."""
+    entropy_weight: float = 0.0
+    """Weight of the entropy bonus."""
+    max_grad_norm: float = 0.5
+    """Global norm at which gradients are clipped."""
+    log_std_init: float = -0.916
+    """Initial log standard deviation of the policy; exp(-0.916) = 0.4."""
+    normalize_advantage: bool = True
+    """Standardise the advantages of each minibatch."""
+    normalize_reward: bool = True
+    """Divide rewards by the running standard deviation of the return."""
+
+
+@dataclass(frozen=True)
+class CollectConfig:
+    """Stage collect: flat PPO, whose ticks become the experience."""
+
+    env: str = ""
+    """Environment to collect in; empty takes env.name."""
+    ticks: int = 1_000_000
+    """Budget of interactions per seed."""
+    capacity: int = 1_000_000
+    """Ticks of experience kept."""
+    ppo: PPOConfig = PPOConfig()
+
+
+@dataclass(frozen=True)
+class OptionsConfig:
+    """Stage learn: the option model, networks E, D, P and F (sections 3.2 and 3.3)."""
+
+    length: int = 5
+    """Ticks per window, and so per option."""
+    size: int = 6
+    """Dimensions of the option code o."""
+    hidden_size: int = 64
+    """Units of the LSTMs of E and D."""
+    mlp_sizes: tuple[int, ...] = (64, 64)
+    """Widths of the hidden layers of P and F."""
+    steps: int = 3000
+    """Gradient steps."""
+    batch_size: int = 256
+    """Windows per gradient step."""
+    learning_rate: float = 3e-3
+    """Step size of Adam for E, D and P."""
+    learning_rate_estimator: float = 1e-3
+    """Step size of Adam for the state estimator F."""
+    lambda_kl: float = 0.01
+    """Weight of L_KL, which keeps the codes near a standard normal."""
+    lambda_adv: float = 0.1
+    """Weight of L_adv, which hides the state from the code."""
+    lambda_pred: float = 1.0
+    """Weight of L_pred, which makes the code's effect predictable."""
+    max_grad_norm: float = 1.0
+    """Global norm at which gradients are clipped."""
+    select: Literal["random", "top"] = "top"
+    """Which episodes of the experience to learn from: any, or those of the highest return."""
+    fraction: float = 0.5
+    """Share of the episodes to learn from."""
+    termination: Literal["fixed"] = "fixed"
+    """When an option ends; fixed: after length ticks (Fix-len)."""
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """Stage train: the policy that acts by choosing options (section 3.5)."""
+
+    ticks: int = 1_000_000
+    """Budget of interactions per seed."""
+    flat: bool = True
+    """Also train the flat baseline, unless collect already did."""
+    ppo: PPOConfig = PPOConfig(log_std_init=0.0)
+
+
+@dataclass(frozen=True)
+class EvaluateConfig:
+    """Stage evaluate: what the trained policies do without exploration."""
+
+    episodes: int = 10
+    """Episodes per seed."""
+    video_ticks: int = 200
+    """Ticks in the video; 0 makes none."""
+
+
+@dataclass(frozen=True)
+class Config:
+    """One experiment: a run is a pure function of this and a key."""
+
+    env: EnvConfig = EnvConfig()
+    collect: CollectConfig = CollectConfig()
+    options: OptionsConfig = OptionsConfig()
+    train: TrainConfig = TrainConfig()
+    evaluate: EvaluateConfig = EvaluateConfig()
+    seed: int = 0
+    """Seed of the PRNG key that everything random comes from."""
+    seeds: int = 1
+    """Independent repeats, trained side by side in one program."""
+
+
+CONFIG_CLASSES = (EnvConfig, PPOConfig, CollectConfig, OptionsConfig, TrainConfig, EvaluateConfig, Config)
+
+# Closed intervals by field name. Other integers are at least 1, other floats at least 0.
+TINY = 1e-6
+BOUNDS: dict[str, tuple[float, float]] = {
+    "num_threads": (0, math.inf),
+    "seed": (0, 2**31 - 1),
+    "video_ticks": (0, math.inf),
+    "clip": (TINY, math.inf),
+    "fraction": (TINY, 1),
+    "gamma": (0, 1),
+    "lambda_": (0, 1),
+    "log_std_init": (-20, 2),
+    "max_grad_norm": (TINY, math.inf),
+}
+
+
+def validate(config: Config) -> None:
+    """Raise `ConfigError` at the first impossible value, naming field, value, expectation and nearest."""
+    for name, value in walk(config):
+        _check_bounds(name, value)
+    for stage in ("collect", "train"):
+        _check_sizes(stage, getattr(config, stage))
+    ticks, length = config.train.ppo.rollout_length, config.options.length
+    if length > ticks:
+        raise _impossible("options.length", length, f"at most train.ppo.rollout_length = {ticks}", ticks)
+
+
+def walk(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield `(dotted name, value)` of every field that is not itself a group of fields."""
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        if dataclasses.is_dataclass(value):
+            yield from walk(value, f"{prefix}{field.name}.")
+        else:
+            yield prefix + field.name, value
+
+
+def _check_bounds(name: str, value: Any) -> None:
+    if value == ():
+        raise ConfigError(f"{name}: expected at least one size, got none; the nearest valid value is 64")
+    for number in value if isinstance(value, tuple) else (value,):
+        if isinstance(number, bool) or not isinstance(number, int | float):
+            continue
+        low, high = BOUNDS.get(name.rpartition(".")[2], (1 if isinstance(number, int) else 0, math.inf))
+        if not (low <= number <= high and math.isfinite(number)):
+            expected = f"at least {low}" if high == math.inf else f"in [{low}, {high}]"
+            nearest = low if math.isnan(number) or number < low else high
+            raise _impossible(name, value, f"a finite number {expected}", nearest)
+
+
+def _check_sizes(stage: str, config: CollectConfig | TrainConfig) -> None:
+    ppo, ticks = config.ppo, config.ppo.num_envs * config.ppo.rollout_length
+    iteration = f"{stage}.ppo.num_envs * {stage}.ppo.rollout_length = {ticks}"
+    if ppo.minibatch_size > ticks:
+        raise _impossible(f"{stage}.ppo.minibatch_size", ppo.minibatch_size, f"at most {iteration}", ticks)
+    if config.ticks < ticks:
+        raise _impossible(f"{stage}.ticks", config.ticks, f"at least one iteration, {iteration}", ticks)
+
+
+def _impossible(name: str, value: Any, expected: str, nearest: int | float) -> ConfigError:
+    hint = f"; the nearest valid value is {nearest}" if math.isfinite(nearest) else ""
+    return ConfigError(f"{name}: expected {expected}, got {value!r}{hint}")

@@ -1,0 +1,69 @@
+"""Evaluation of an agent in whole episodes, and trajectories for videos."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Key
+
+from taic_jax.envs.base import Env, State
+from taic_jax.envs.wrappers import AutoReset
+from taic_jax.rl.ppo import Agent
+from taic_jax.rl.rollout import Rollout, rollout, start
+
+
+def evaluate(
+    env: Env, agent: Agent, key: Key[Array, ""], episodes: int, deterministic: bool = False
+) -> dict[str, Array]:
+    """Return means over `episodes` whole episodes, one per environment, each from a fresh start.
+
+    Args:
+      env: the task, not yet wrapped to reset itself.
+      agent: what acts.
+      key: consumed.
+      episodes: number of episodes.
+      deterministic: take the mean option instead of drawing one.
+
+    Returns:
+      Scalars: `return`, `length` in ticks, and of every metric of the task its mean over the ticks of an episode
+      (`mean/NAME`) and its value at the last tick (`final/NAME`).
+    """
+    ticks = _run(env, agent, key, episodes, env.episode_length, deterministic, _metrics)
+    done = (ticks.terminated | ticks.truncated).astype(jnp.float32)
+    first = (jnp.cumsum(done, axis=0) - done == 0).astype(jnp.float32)
+    length = jnp.sum(first, axis=0)
+    result = {"return": jnp.sum(first * ticks.reward, axis=0), "length": length}
+    for name, values in ticks.extras.items():
+        result[f"mean/{name}"] = jnp.sum(first * values, axis=0) / length
+        result[f"final/{name}"] = jnp.sum(first * done * values, axis=0)
+    return jax.tree.map(jnp.mean, result)
+
+
+def record(env: Env, agent: Agent, key: Key[Array, ""], ticks: int) -> Any:
+    """Return `ticks` ticks of physics [T, ...] of one environment under the mean options, for `env.render`."""
+    run = _run(env, agent, key, 1, ticks, True, _physics)
+    return jax.tree.map(lambda x: x[:, 0], run.extras)
+
+
+def _metrics(state: State) -> dict[str, Array]:
+    return state.metrics
+
+
+def _physics(state: State) -> Any:
+    return state.physics
+
+
+def _run(
+    env: Env,
+    agent: Agent,
+    key: Key[Array, ""],
+    num_envs: int,
+    ticks: int,
+    deterministic: bool,
+    keep: Callable[[State], Any],
+) -> Rollout:
+    key_start, key_rollout = jax.random.split(key)
+    env = AutoReset(env)
+    running = start(env, agent.executor, num_envs, key_start)
+    return rollout(env, agent.executor, agent.decide(deterministic), running, key_rollout, ticks, keep)[1]

@@ -1,0 +1,130 @@
+"""Experience: flat PPO's training trajectories, on disk as one file per iteration, bounded in number.
+
+A file holds the newest T ticks of every environment and seed, so a run that is killed loses at most the
+iteration it was in, and a resumed one writes the same files again.
+"""
+
+import json
+import os
+from functools import partial
+from pathlib import Path
+
+import jax
+import numpy as np
+from jaxtyping import Array, Key
+
+from taic_jax.checkpoint import ArtifactError
+from taic_jax.config import CollectConfig
+from taic_jax.envs.base import Env
+from taic_jax.options.dataset import Experience
+from taic_jax.options.execution import IdentityExecutor
+from taic_jax.rl import ppo
+from taic_jax.rl.rollout import Rollout
+from taic_jax.types import as_arrays
+
+FIELDS = ("obs", "action", "reward", "done")
+
+
+def as_experience(ticks: Rollout, proprioceptive_size: int) -> Experience:
+    """Keep what option learning needs of a rollout."""
+    done = ticks.terminated | ticks.truncated
+    return Experience(ticks.obs[..., :proprioceptive_size], ticks.action, ticks.reward, done)
+
+
+def collect(
+    config: CollectConfig, env: Env, key: Key[Array, ""]
+) -> tuple[ppo.Agent, dict[str, Array], Experience]:
+    """Train flat PPO in `env` and keep its newest `config.capacity` ticks; pure, so keys may be vmapped.
+
+    Returns the agent, the metrics of every iteration, and the experience [T, B, ...].
+    """
+    config = as_arrays(config)
+    executor = IdentityExecutor(env.action_size)
+    count = ppo.num_iterations(config.ppo, config.ticks)
+    kept = min(num_blocks(config), count)
+    step = partial(_iteration, config, env, executor, count)
+    state = ppo.init(config.ppo, env, executor, key)
+    state, (early, _) = jax.lax.scan(partial(step, False), state, None, count - kept)
+    state, (late, blocks) = jax.lax.scan(partial(step, True), state, None, kept)
+    metrics = jax.tree.map(lambda a, b: jax.numpy.concatenate([a, b]), early, late)
+    experience = jax.tree.map(lambda x: x.reshape((-1, *x.shape[2:])), blocks)
+    return ppo.as_agent(config.ppo, executor, state), metrics, experience
+
+
+def _iteration(
+    config: CollectConfig,
+    env: Env,
+    executor: IdentityExecutor,
+    count: int,
+    keep: bool,
+    state: ppo.TrainState,
+    _: None,
+) -> tuple[ppo.TrainState, tuple[dict[str, Array], Experience | None]]:
+    state, metrics, ticks = ppo.iterate(config.ppo, env, executor, count, state)
+    return state, (metrics, as_experience(ticks, env.proprioceptive_size) if keep else None)
+
+
+def num_blocks(config: CollectConfig) -> int:
+    """Return how many iterations' worth of experience the capacity holds, at least one."""
+    return max(config.capacity // (config.ppo.num_envs * config.ppo.rollout_length), 1)
+
+
+def experience_bytes(env: Env, ticks: int) -> int:
+    """Return the bytes that `ticks` ticks of experience of one seed take, on disk and in memory."""
+    return ticks * (4 * (env.proprioceptive_size + env.action_size + 1) + 1)
+
+
+class ExperienceStore:
+    """A folder of blocks [K, T, B, ...]; the oldest block goes when `capacity` blocks are there.
+
+    Args:
+      folder: made if missing.
+      capacity: number of blocks kept.
+      description: what the experience is of; saved as JSON and compared on reading.
+    """
+
+    def __init__(self, folder: Path, capacity: int, description: dict):
+        self.folder, self.capacity = folder, capacity
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "description.json").write_text(json.dumps(description, indent=2) + "\n")
+
+    def write(self, iteration: int, block: Experience) -> None:
+        """Save the block of one iteration, atomically, and drop the block that no longer fits."""
+        path = self.folder / f"{iteration:06d}.npz"
+        temporary = path.with_suffix(".tmp")
+        with temporary.open("wb") as file:
+            np.savez(file, **{name: np.asarray(getattr(block, name)) for name in FIELDS})
+        os.replace(temporary, path)
+        (self.folder / f"{iteration - self.capacity:06d}.npz").unlink(missing_ok=True)
+
+
+def read_description(folder: Path) -> dict:
+    """Return what a folder of experience is of.
+
+    Raises:
+      ArtifactError: if it is no such folder.
+    """
+    try:
+        return json.loads((folder / "description.json").read_text())
+    except (OSError, ValueError) as error:
+        raise ArtifactError(f"{folder} holds no experience: {error}") from None
+
+
+def read_experience(folder: Path, seed: int) -> Experience:
+    """Return all blocks of one seed in time order: [T, B, ...] NumPy arrays.
+
+    Raises:
+      ArtifactError: if there is no block, or one cannot be read.
+    """
+    paths = sorted(folder.glob("[0-9]*.npz"))
+    if not paths:
+        raise ArtifactError(f"{folder} holds no experience: no file like 000000.npz in it")
+    blocks: dict[str, list[np.ndarray]] = {name: [] for name in FIELDS}
+    for path in paths:
+        try:
+            with np.load(path, allow_pickle=False) as block:
+                for name in FIELDS:
+                    blocks[name].append(block[name][seed])
+        except (OSError, ValueError, KeyError, IndexError) as error:
+            raise ArtifactError(f"{path} is no block of experience with seed {seed}: {error}") from None
+    return Experience(**{name: np.concatenate(arrays) for name, arrays in blocks.items()})

@@ -1,0 +1,152 @@
+"""Metrics of a run: one row per log point in metrics.jsonl, TensorBoard events, and a progress line.
+
+metrics.jsonl is the record; the events are drawn from it. So when a run resumes, rows after the checkpoint
+are dropped from the one, and the other is drawn again.
+"""
+
+import contextlib
+import json
+import math
+import os
+import shutil
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tensorboardX
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+
+Row = dict[str, Any]
+
+
+class RunLogger:
+    """Write what a run measures; a context manager.
+
+    A row of metrics.jsonl holds `stage`, `ticks`, `time` (seconds since the epoch), and each metric as
+    `stage/name`: a number, or a list with one number per seed. What is not finite is null. Events hold the
+    mean over seeds.
+
+    Args:
+        run_dir: folder of the run; rows that it already holds are kept, but for a half-written last one.
+        quiet: never show the progress line, which otherwise appears on a terminal's standard error.
+    """
+
+    def __init__(self, run_dir: Path, *, quiet: bool = False):
+        run_dir.mkdir(parents=True, exist_ok=True)
+        self._path, self._events_dir = run_dir / "metrics.jsonl", run_dir / "tensorboard"
+        _drop_half_row(self._path)
+        self._open()
+        console = Console(stderr=True)
+        self._progress = Progress(
+            TextColumn("{task.description:>8}"),
+            BarColumn(bar_width=24),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[speed]}  {task.fields[result]}"),
+            TimeRemainingColumn(),
+            console=console,
+            disable=quiet or not console.is_terminal,
+        )
+        self._task: TaskID | None = None
+
+    def __enter__(self) -> "RunLogger":
+        self._progress.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._progress.stop()
+        self._close()
+
+    @contextlib.contextmanager
+    def stage(self, name: str, total_ticks: int, done: int = 0) -> Iterator[None]:
+        """Show the progress of a stage of `total_ticks`, of which `done` were ticked before a resume."""
+        self._task = self._progress.add_task(name, total=total_ticks, completed=done, speed="", result="")
+        self._started, self._done = time.monotonic(), done
+        try:
+            yield
+        finally:
+            self._progress.stop_task(self._task)
+            self._task = None
+
+    def log(self, stage: str, ticks: int, metrics: Mapping[str, Any]) -> None:
+        """Write one row.
+
+        Args:
+            stage: name of the stage; each metric is written as `stage/name`.
+            ticks: interactions so far in this stage, per seed.
+            metrics: numbers, or arrays of shape [K] with one number per seed.
+        """
+        row: Row = {"stage": stage, "ticks": ticks, "time": round(time.time(), 3)}
+        row |= {f"{stage}/{name}": _to_json(value) for name, value in metrics.items()}
+        self._file.write(json.dumps(row, allow_nan=False) + "\n")
+        self._file.flush()
+        self._write_events(row)
+        if self._task is not None:
+            self._show(self._task, row)
+
+    def truncate(self, stage: str, ticks: int) -> None:
+        """Drop the rows of a stage after `ticks`, which a resumed run will write again; -1 drops them all."""
+        rows = read_metrics(self._path)
+        kept = [row for row in rows if row["stage"] != stage or row["ticks"] <= ticks]
+        if len(kept) == len(rows):
+            return
+        self._close()
+        shutil.rmtree(self._events_dir, ignore_errors=True)
+        partial = self._path.with_suffix(".partial")
+        partial.write_text("".join(json.dumps(row) + "\n" for row in kept))
+        os.replace(partial, self._path)
+        self._open()
+        for row in kept:
+            self._write_events(row)
+
+    def _open(self) -> None:
+        self._file = self._path.open("a")
+        self._events = tensorboardX.SummaryWriter(str(self._events_dir))
+
+    def _close(self) -> None:
+        self._file.close()
+        self._events.close()
+
+    def _write_events(self, row: Row) -> None:
+        for name, value in row.items():
+            if "/" in name and (mean := _mean(value)) is not None:
+                self._events.add_scalar(name, mean, row["ticks"], walltime=row["time"])
+
+    def _show(self, task: TaskID, row: Row) -> None:
+        seconds = max(time.monotonic() - self._started, 1e-9)
+        result = _mean(row.get(f"{row['stage']}/return"))
+        self._progress.update(
+            task,
+            completed=row["ticks"],
+            speed=f"{(row['ticks'] - self._done) / seconds:,.0f} ticks/s",
+            result="" if result is None else f"return {result:.1f}",
+        )
+
+
+def read_metrics(path: Path) -> list[Row]:
+    """Read the rows of a metrics.jsonl; a half-written last one is left out."""
+    return [json.loads(line) for line in path.read_text().splitlines(keepends=True) if line.endswith("\n")]
+
+
+def _drop_half_row(path: Path) -> None:
+    """Cut what a killed run left after the last newline."""
+    if path.exists():
+        with path.open("rb+") as file:
+            file.truncate(file.read().rfind(b"\n") + 1)
+
+
+def _to_json(value: Any) -> Any:
+    """Turn a number or an array [K] into numbers that JSON knows; what is not finite becomes None."""
+    numbers = np.asarray(value)
+    if numbers.ndim:
+        return [_to_json(number) for number in numbers]
+    number = numbers.astype(np.float64).item() if numbers.dtype.kind not in "iu" else numbers.item()
+    return number if math.isfinite(number) else None
+
+
+def _mean(value: Any) -> float | None:
+    """Return the mean over the seeds that are finite, or None if none is."""
+    numbers = [number for number in (value if isinstance(value, list) else [value]) if number is not None]
+    return sum(numbers) / len(numbers) if numbers else None

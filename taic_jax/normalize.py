@@ -1,0 +1,57 @@
+"""Running statistics of observations and rewards, on top of Brax's maintained implementation."""
+
+import jax
+import jax.numpy as jnp
+from brax.training.acme import running_statistics
+from flax import struct
+from jaxtyping import Array, Bool, Float
+
+Statistics = running_statistics.RunningStatisticsState
+"""Mean and standard deviation of everything seen so far, with a 64-bit count."""
+
+
+def init(shape: tuple[int, ...] = ()) -> Statistics:
+    """Return statistics of nothing: mean 0, standard deviation 1."""
+    return running_statistics.init_state(jnp.zeros(shape))
+
+
+def update(statistics: Statistics, batch: Float[Array, "..."]) -> Statistics:
+    """Take in a batch whose trailing axes have the statistics' shape."""
+    # Brax broadcasts the mean over the batch axes implicitly.
+    with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
+        return running_statistics.update(statistics, batch, validate_shapes=False)
+
+
+def normalize(statistics: Statistics, x: Float[Array, "..."], clip: float = 10.0) -> Float[Array, "..."]:
+    """Return (x - mean) / std, clipped to `clip` standard deviations."""
+    with jax.numpy_rank_promotion("allow"):
+        return jnp.clip((x - statistics.mean) / statistics.std, -clip, clip)
+
+
+class RewardScale(struct.PyTreeNode):
+    """Statistics of the running discounted return of each environment [B]."""
+
+    statistics: Statistics
+    discounted_return: Array
+
+
+def init_reward_scale(num_envs: int) -> RewardScale:
+    """Return the scale before any reward was seen."""
+    return RewardScale(init(), jnp.zeros(num_envs))
+
+
+def scale_rewards(
+    scale: RewardScale, reward: Float[Array, "T B"], done: Bool[Array, "T B"], gamma: Float[Array, ""]
+) -> tuple[RewardScale, Float[Array, "T B"]]:
+    """Divide rewards by the standard deviation of the discounted return, the new ticks taken in first."""
+
+    def tick(total: Array, step: tuple[Array, Array]) -> tuple[Array, Array]:
+        reward_t, done_t = step
+        total = gamma * total + reward_t
+        return jnp.where(done_t, 0.0, total), total
+
+    with jax.numpy_rank_promotion("allow"):
+        discounted_return, totals = jax.lax.scan(tick, scale.discounted_return, (reward, done))
+        statistics = update(scale.statistics, totals)
+        scaled = jnp.clip(reward / jnp.maximum(statistics.std, 1e-4), -10.0, 10.0)
+    return RewardScale(statistics, discounted_return), scaled

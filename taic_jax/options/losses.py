@@ -1,0 +1,52 @@
+"""The losses of option learning, each of one window: the caller vmaps and averages."""
+
+from functools import partial
+
+import distrax
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+
+def reconstruction_loss(
+    decoded: Float[Array, "L A"], actions: Float[Array, "L A"], mask: Bool[Array, " L"]
+) -> Float[Array, ""]:
+    """L_Recons (eq. 3): mean squared error over the window's own actions."""
+    errors = jnp.mean(jnp.square(decoded - actions), axis=-1)
+    return jnp.sum(jnp.where(mask, errors, 0.0)) / jnp.sum(mask, dtype=jnp.float32)
+
+
+def kl_loss(mean: Float[Array, " D"], log_std: Float[Array, " D"]) -> Float[Array, ""]:
+    """L_KL (eq. 2): KL(q(o|a) || N(0, I)) in nats."""
+    posterior = distrax.MultivariateNormalDiag(mean, jnp.exp(log_std))
+    prior = distrax.MultivariateNormalDiag(jnp.zeros_like(mean), jnp.ones_like(mean))
+    return posterior.kl_divergence(prior)
+
+
+def prediction_loss(predicted: Float[Array, " P"], change: Float[Array, " P"]) -> Float[Array, ""]:
+    """L_pred (eq. 8): mean squared error of the normalised state change."""
+    return jnp.mean(jnp.square(predicted - change))
+
+
+def adversarial_loss(
+    estimated: Float[Array, "2 P"], start: Float[Array, " P"], end: Float[Array, " P"]
+) -> Float[Array, ""]:
+    """L_adv (eq. 9): F's mean squared error on normalised start and end state."""
+    return jnp.mean(jnp.square(estimated - jnp.stack([start, end])))
+
+
+@partial(jax.custom_vjp, nondiff_argnums=())
+def gradient_reversal(x: Array, scale: Array) -> Array:
+    """Return x; its gradient is multiplied by -scale on the way back (figure 2)."""
+    return x
+
+
+def _reversal_forward(x: Array, scale: Array) -> tuple[Array, Array]:
+    return x, scale
+
+
+def _reversal_backward(scale: Array, gradient: Array) -> tuple[Array, Array]:
+    return -scale * gradient, jnp.zeros_like(scale)
+
+
+gradient_reversal.defvjp(_reversal_forward, _reversal_backward)

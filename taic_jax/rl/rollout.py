@@ -1,0 +1,110 @@
+"""Options in lockstep ticks: the one rollout of both levels.
+
+Every tick every environment takes one real step. Where the running option ended the policy decides on a new
+one; then the executor emits the next action; then the termination rule is asked.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Float, Key
+
+from taic_jax.envs.base import Env, State
+from taic_jax.options.execution import Executor
+from taic_jax.types import select
+
+DecideFn = Callable[[Array, Array], tuple[Array, Array]]
+"""(observations [B, S], standard normal noise [B, D]) -> (options [B, D], log-probabilities [B])."""
+
+
+class Running(struct.PyTreeNode):
+    """What is carried from tick to tick, leading axis B."""
+
+    env: State
+    option: Any
+    ended: Array
+    episode_return: Array
+    last_return: Array
+
+
+class Rollout(struct.PyTreeNode):
+    """T ticks of B environments; `option` and `log_prob` mean something only where `decision`."""
+
+    obs: Array
+    option: Array
+    log_prob: Array
+    decision: Array
+    action: Array
+    reward: Array
+    ended: Array
+    terminated: Array
+    truncated: Array
+    final_obs: Array
+    episode_return: Array
+    extras: Any
+
+
+def start(env: Env, executor: Executor, num_envs: int, key: Key[Array, ""]) -> Running:
+    """Reset `num_envs` environments; every one of them decides at its first tick."""
+    state = jax.vmap(env.reset)(jax.random.split(key, num_envs))
+    options = jax.vmap(executor.start)(jnp.zeros((num_envs, executor.option_size)), state.obs)
+    zeros = jnp.zeros(num_envs)
+    return Running(state, options, jnp.ones(num_envs, bool), zeros, jnp.full(num_envs, jnp.nan))
+
+
+def _tick(
+    env: Env,
+    executor: Executor,
+    decide: DecideFn,
+    keep: Callable[[State], Any],
+    running: Running,
+    noise: Float[Array, "B D"],
+) -> tuple[Running, Rollout]:
+    obs, decision = running.env.obs, running.ended
+    option, log_prob = decide(obs, noise)
+    fresh = jax.vmap(executor.start)(option, obs)
+    carry, action = jax.vmap(executor.act)(select(decision, fresh, running.option), obs)
+    state = jax.vmap(env.step)(running.env, action)
+    done = state.terminated | state.truncated
+    ended = jax.vmap(executor.ended)(carry, state.final_obs) | done
+    total = running.episode_return + state.reward
+    tick = Rollout(
+        obs=obs, option=option, log_prob=log_prob, decision=decision, action=action, reward=state.reward,
+        ended=ended, terminated=state.terminated, truncated=state.truncated, final_obs=state.final_obs,
+        episode_return=total, extras=keep(state),
+    )  # fmt: skip
+    last_return = jnp.where(done, total, running.last_return)
+    return Running(state, carry, ended, jnp.where(done, 0.0, total), last_return), tick
+
+
+def nothing(state: State) -> None:
+    """Keep no extras of a tick."""
+
+
+def rollout(
+    env: Env,
+    executor: Executor,
+    decide: DecideFn,
+    running: Running,
+    key: Key[Array, ""],
+    length: int,
+    keep: Callable[[State], Any] = nothing,
+) -> tuple[Running, Rollout]:
+    """Run `length` ticks of every environment.
+
+    Args:
+      env: an environment that resets itself (`AutoReset`).
+      executor: what turns an option into actions.
+      decide: the policy.
+      running: from `start` or from the previous rollout.
+      key: consumed.
+      length: T.
+      keep: what else to record of the state after each tick (before a reset: reward and metrics only).
+    """
+    num_envs = running.ended.shape[0]
+    noise = jax.random.normal(key, (length, num_envs, executor.option_size))
+    return jax.lax.scan(partial(_tick, env, executor, decide, keep), running, noise)

@@ -1,0 +1,159 @@
+"""The command line: `python -m taic_jax.run [CONFIG] [--run-dir DIR] [--section.field value ...]`.
+
+The command is parsed and checked before JAX is imported, so that help and mistakes answer at once.
+"""
+
+import contextlib
+import io
+import itertools
+import os
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, get_type_hints
+
+import tyro
+
+from taic_jax.config import Config, ConfigError, validate, walk
+from taic_jax.config_io import closest, load_config, mistyped, preset_names, to_yaml
+
+DEFAULT_PRESET = "nav2d"
+PROGRAM = "python -m taic_jax.run"
+
+
+@dataclass(frozen=True)
+class Command:
+    """Collect experience, learn options from it, train a policy that chooses among them, and evaluate."""
+
+    source: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="CONFIG")] = DEFAULT_PRESET
+    """Name of a preset, or path of a YAML file; with --resume by default the run's own."""
+    run_dir: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    """Folder of the run; by default runs/CONFIG-DATE-TIME."""
+    resume: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Continue the run in --run-dir from its last checkpoint."""
+    overwrite: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Replace the run in --run-dir."""
+    dry_run: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Print the configuration and the plan, and stop."""
+    config: Annotated[Config, tyro.conf.arg(name=""), tyro.conf.FlagConversionOff] = Config()
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit code: 0, 2 for a mistake of the user, or 130 when interrupted."""
+    try:
+        execute(parse(sys.argv[1:] if args is None else args))
+    except KeyboardInterrupt:
+        print("taic_jax: interrupted; --resume continues from the last checkpoint", file=sys.stderr)
+        return 130
+    except BrokenPipeError:  # the reader, such as head, has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except (ValueError, OSError) as error:
+        if not _is_mistake(error):
+            raise
+        print("taic_jax: error:", " ".join(str(error).split()), file=sys.stderr)
+        return 2
+    return 0
+
+
+def parse(args: Sequence[str]) -> Command:
+    """Parse and check the arguments; the fields start from the preset or file that they name.
+
+    Raises:
+        ConfigError: an argument, the named preset or file, or a value is not valid.
+    """
+    first = args[0] if args and not args[0].startswith("-") else DEFAULT_PRESET
+    command = _parse_over(args, first)
+    if command.resume and command.overwrite:
+        raise ConfigError("--resume and --overwrite: expected at most one of the two")
+    if command.resume and command.run_dir is None:
+        raise ConfigError("--resume: expected the folder of the run to continue, as in --run-dir DIR")
+    if command.run_dir and command.resume and command.source not in args:
+        own = command.run_dir / "config.yaml"
+        command = _parse_over(args, str(own)) if own.is_file() else command
+    elif command.source != first:
+        command = _parse_over(args, command.source)
+    validate(command.config)
+    return command
+
+
+def execute(command: Command) -> None:
+    """Run the experiment, or only print its configuration and plan."""
+    from taic_jax.pipeline import make_envs, run_pipeline
+    from taic_jax.summary import plan
+
+    if command.dry_run:
+        print(to_yaml(command.config))
+        print(plan(command.config, *make_envs(command.config)))
+        return
+    name = f"{Path(command.source).stem}-{time.strftime('%Y%m%d-%H%M%S')}"
+    run_dir = command.run_dir or Path("runs") / name
+    run_pipeline(command.config, run_dir, resume=command.resume, overwrite=command.overwrite)
+    print(run_dir / "summary.json")
+
+
+def _parse_over(args: Sequence[str], source: str) -> Command:
+    default = Command(source=source, config=load_config(source))
+    description = f"{Command.__doc__}\n\nPresets: {', '.join(preset_names())}."
+    if "-h" in args or "--help" in args:  # alone, or tyro leaves the arguments before it out of the help
+        args = ["--help"]
+    try:
+        with contextlib.redirect_stderr(io.StringIO()):
+            return tyro.cli(Command, prog=PROGRAM, description=description, args=args, default=default)
+    except SystemExit as stop:
+        if not stop.code:
+            raise
+    raise _explain(args)
+
+
+def _explain(args: Sequence[str]) -> ConfigError:
+    """Find the argument that tyro refused, by parsing each option alone, and tell it in one line."""
+    hints = {**get_type_hints(Command), **{name: _kind(name) for name, _ in walk(Config())}}
+    known = {f"--{name}": kind for name, kind in hints.items() if name not in ("source", "config")}
+    for option, values in _options(args):
+        name = "--" + option.lstrip("-").replace("-", "_")
+        if name not in known:
+            return ConfigError(f"unknown option {option}; the nearest is {closest(name, known)}")
+        try:
+            with contextlib.redirect_stderr(io.StringIO()):
+                tyro.cli(Command, args=[option, *values])
+        except SystemExit:
+            return mistyped(option, known[name], " ".join(values) or None)
+    return ConfigError(
+        f"unexpected argument in {' '.join(args)!r}; expected one CONFIG and options, see --help"
+    )
+
+
+def _options(args: Sequence[str]) -> Iterator[tuple[str, list[str]]]:
+    """Yield each option with the values that follow it."""
+    starts = [i for i, arg in enumerate(args) if arg.startswith("-") and not _is_number(arg)]
+    for start, end in itertools.pairwise([*starts, len(args)]):
+        option, equals, value = args[start].partition("=")
+        yield option, [value] * bool(equals) + list(args[start + 1 : end])
+
+
+def _kind(name: str) -> Any:
+    """Return the type of the field with this dotted name."""
+    kind: Any = Config
+    for part in name.split("."):
+        kind = get_type_hints(kind)[part]
+    return kind
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _is_mistake(error: ValueError | OSError) -> bool:
+    """Tell a mistake of the user (our own errors, files that cannot be used) from one of the program."""
+    ours = type(error).__module__.partition(".")[0] == "taic_jax"
+    return ours or (isinstance(error, OSError) and error.filename is not None)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,96 @@
+"""What a run leaves behind beside its artifacts: the plan before it, the summary and the video after it."""
+
+import subprocess
+from collections.abc import Mapping
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from PIL import Image
+
+from taic_jax.config import Config
+from taic_jax.envs.base import Env
+from taic_jax.evaluate import record
+from taic_jax.experience import experience_bytes
+from taic_jax.rl.ppo import Agent, num_iterations
+from taic_jax.stage import Run
+from taic_jax.statistics import summarize
+
+PACKAGES = ("taic_jax", "jax", "jaxlib", "flax", "optax", "brax", "mujoco", "mujoco-mjx", "orbax-checkpoint")
+MIB = 2**20
+
+
+def plan(config: Config, env: Env, source: Env) -> str:
+    """Return what a run will cost: interactions and memory, one line a stage."""
+    collect, options, train = config.collect, config.options, config.train
+    rows = [("collect", source, collect.ppo, collect.ticks), ("train", env, train.ppo, train.ticks)]
+    if config.collect.env and train.flat:
+        rows.append(("flat", env, collect.ppo, train.ticks))
+    lines = []
+    for stage, task, ppo, ticks in rows:
+        iterations = num_iterations(ppo, ticks)
+        real = iterations * ppo.num_envs * ppo.rollout_length
+        lines.append(f"{stage:8} {task.name}: {real:,} ticks x {config.seeds} seeds in {iterations} iterations")
+    kept = min(collect.capacity, collect.ticks)
+    size = experience_bytes(source, kept) * config.seeds / MIB
+    lines.insert(1, f"{'learn':8} {options.steps:,} gradient steps on windows of {options.length} ticks")
+    lines.append(f"{'memory':8} experience {size:,.0f} MiB on disk, {2 * size:,.0f} MiB while options are learnt")
+    return "\n".join(lines)
+
+
+def as_summary(run: Run, methods: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the contents of `summary.json`.
+
+    Args:
+      run: after its last stage.
+      methods: by name, the evaluations `first` and `last` of `pipeline.Trained`.
+    """
+    clock = run.clock
+    return {
+        "ticks": clock.ticks,
+        "ticks_per_second": clock.ticks / clock.run if clock.run else None,
+        "seconds": {"compile": clock.compile, "run": clock.run},
+        "methods": {name: _method(**evaluations) for name, evaluations in methods.items()},
+        "versions": {name: metadata.version(name) for name in PACKAGES},
+        "commit": commit(),
+    }
+
+
+def _method(first: Mapping[str, Mapping], last: Mapping[str, Mapping]) -> dict[str, Any]:
+    """Summarise every evaluated quantity over seeds; `return` is of the policy as it explores."""
+    result = {}
+    for mode in last:
+        result[mode] = summarize(last[mode]["return"])
+        result[mode]["first_per_seed"] = np.asarray(first[mode]["return"], float).tolist()
+    result["metrics"] = {name: summarize(values) for name, values in last["return_mean_option"].items()}
+    return result
+
+
+def commit() -> str | None:
+    """Return the git commit of the checkout this package runs from, with `-dirty` if it was changed, or None."""
+    command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--abbrev=40"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return None
+
+
+def write_video(run: Run, env: Env, agent: Agent) -> None:
+    """Write `video.webp`: the first seed's policy taking its mean options."""
+    ticks = run.config.evaluate.video_ticks
+    if not ticks:
+        return
+    agent = jax.tree.map(lambda x: x[0], agent)
+    key = run.stage_keys("video")[0]
+    physics = run.compile(lambda agent, key: record(env, agent, key, ticks), agent, key)(agent, key)
+    write_webp(run.dir / "video.webp", env.render(jax.device_get(physics)), env.dt)
+
+
+def write_webp(path: Path, frames: np.ndarray, dt: float) -> None:
+    """Write frames [T, H, W, 3] as an animation in real time, at most 25 a second."""
+    every = max(round(0.04 / dt), 1)
+    images = [Image.fromarray(frame) for frame in frames[::every]]
+    images[0].save(path, save_all=True, append_images=images[1:], duration=round(1000 * dt * every), loop=0)
+

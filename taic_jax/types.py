@@ -1,0 +1,47 @@
+"""Axes, the pytree view of the configuration, and small array helpers.
+
+Axes, used in every docstring of the package:
+`T` ticks, `B` environments, `N` windows, `L` longest option, `D` option size, `A` action size,
+`S` observation size, `P` size of the proprioceptive slice, `G` sweep points, `K` seeds.
+"""
+
+import dataclasses
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool
+
+from taic_jax import config
+
+Tree = TypeVar("Tree")
+
+
+def _register(cls: type) -> None:
+    """Make a config class a pytree: floats and nested configs are children, all else is static."""
+    fields = dataclasses.fields(cls)
+    leaves = [f.name for f in fields if f.type is float or dataclasses.is_dataclass(f.type)]
+    static = [f.name for f in fields if f.name not in leaves]
+    jax.tree_util.register_dataclass(cls, data_fields=leaves, meta_fields=static)
+
+
+for _cls in config.CONFIG_CLASSES:
+    _register(_cls)
+
+
+def as_arrays(tree: Tree) -> Tree:
+    """Turn every float of a config into a strongly typed float32 array, so that it can be vmapped.
+
+    Python floats would be weakly typed leaves, and a second call with arrays would compile again.
+    """
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), tree)
+
+
+def select(condition: Bool[Array, " B"], if_true: Tree, if_false: Tree) -> Tree:
+    """Choose between two trees along their leading axis B."""
+
+    def choose(a: Any, b: Any) -> Any:
+        return jnp.where(condition.reshape((-1,) + (1,) * (a.ndim - 1)), a, b)
+
+    with jax.numpy_rank_promotion("allow"):
+        return jax.tree.map(choose, if_true, if_false)

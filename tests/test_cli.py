@@ -1,0 +1,218 @@
+"""The command line: what it accepts, and that every mistake is one line, exit code 2, nothing written."""
+
+import dataclasses
+import inspect
+import subprocess
+import sys
+import types
+from pathlib import Path
+
+import pytest
+
+from taic_jax import run
+from taic_jax.checkpoint import ArtifactError
+from taic_jax.config import CONFIG_CLASSES, Config, ConfigError
+from taic_jax.config_io import load_config, to_yaml
+from taic_jax.run import main, parse
+
+
+@pytest.fixture(autouse=True)
+def in_empty_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture
+def pipeline(monkeypatch):
+    """Stand in for the pipeline, and record what it is asked to run."""
+    calls = []
+
+    def run_pipeline(config, run_dir, *, resume, overwrite):
+        calls.append((config, run_dir, resume, overwrite))
+
+    fake = types.SimpleNamespace(run_pipeline=run_pipeline, make_envs=lambda config: ("env", "source"))
+    monkeypatch.setitem(sys.modules, "taic_jax.pipeline", fake)
+    monkeypatch.setitem(sys.modules, "taic_jax.summary", types.SimpleNamespace(plan=lambda *args: "the plan"))
+    return calls
+
+
+def test_without_arguments_the_default_preset_runs(pipeline):
+    assert main([]) == 0
+    ((config, run_dir, resume, overwrite),) = pipeline
+    assert config == load_config("nav2d") and not resume and not overwrite
+    assert run_dir.parent == Path("runs") and run_dir.name.startswith("nav2d-")
+
+
+def test_options_override_the_preset_however_they_are_spelled():
+    args = ["half_cheetah", "--train.ppo.learning-rate", "1e-2", "--train.ppo.num_envs=32", "--seeds", "3"]
+    config = parse(
+        [*args, "--options.mlp-sizes", "8", "4", "--train.flat", "False", "--train.ppo.lambda_", "0.5"]
+    ).config
+    assert (config.train.ppo.learning_rate, config.train.ppo.num_envs, config.seeds) == (1e-2, 32, 3)
+    assert (config.options.mlp_sizes, config.train.flat, config.train.ppo.lambda_) == ((8, 4), False, 0.5)
+    assert config.collect == load_config("half_cheetah").collect
+
+
+def test_the_config_may_stand_last_or_be_a_file():
+    Path("mine.yaml").write_text("seed: 5\nenv: {name: ant}")
+    for args in (["--seeds", "2", "mine.yaml"], ["mine.yaml", "--seeds", "2"], ["./mine.yaml", "--seeds=2"]):
+        config = parse(args).config
+        assert (config.seed, config.seeds, config.env.name) == (5, 2, "ant")
+
+
+def test_resume_takes_the_config_of_the_run(pipeline):
+    Path("old").mkdir()
+    Path("old/config.yaml").write_text(to_yaml(load_config("ant")))
+    assert main(["--resume", "--run-dir", "old"]) == 0
+    assert main(["nav2d", "--resume", "--run-dir", "old"]) == 0
+    assert [call[0].env.name for call in pipeline] == ["ant", "nav2d"]
+    assert pipeline[0][1:] == (Path("old"), True, False)
+
+
+def test_dry_run_prints_the_config_and_the_plan_and_stops(pipeline, capsys):
+    assert main(["ant", "--seed", "3", "--dry-run"]) == 0
+    out = capsys.readouterr().out
+    Path("printed.yaml").write_text(out.replace("the plan", ""))
+    assert load_config("printed.yaml") == parse(["ant", "--seed", "3"]).config
+    assert out.endswith("the plan\n") and pipeline == []
+
+
+BAD_ARGUMENTS = {
+    "unknown preset": ("nav2", "unknown preset 'nav2'", "nearest is nav2d"),
+    "missing file": ("missing.yaml", "missing.yaml", "No such file"),
+    "folder": ("./", "./", "directory"),
+    "two configs": ("nav2d ant", "unexpected argument", "one CONFIG"),
+    "unknown option": (
+        "--train.ppo.learning-rat 1",
+        "--train.ppo.learning-rat;",
+        "--train.ppo.learning_rate",
+    ),
+    "option without group": (
+        "--learning_rate_estimator 1",
+        "unknown option",
+        "--options.learning_rate_estimator",
+    ),
+    "unknown group": ("--trian.ticks 3", "--trian.ticks", "--train.ticks"),
+    "group as option": ("--train.ppo 3", "unknown option --train.ppo;", "nearest is --train.ppo."),
+    "short option": ("-x", "unknown option -x", "nearest"),
+    "text for float": ("--train.ppo.clip wide", "--train.ppo.clip: expected a number", "'wide'"),
+    "float for integer": ("--seeds 2.6", "--seeds: expected an integer, got '2.6'", "nearest is 3"),
+    "exponent for integer": ("--train.ticks 1e6", "--train.ticks: expected an integer", "nearest is 1000000"),
+    "empty value": ("--seed=", "--seed: expected an integer", "nothing"),
+    "no value": ("--seed", "--seed: expected an integer", "nothing"),
+    "no folder": ("--run-dir", "--run-dir: expected", "nothing"),
+    "unknown choice": ("--env.backend mujco", "--env.backend: expected one of auto", "nearest is mujoco"),
+    "case of a bool": ("--train.flat false", "--train.flat: expected one of True, False", "nearest is False"),
+    "text in a list": ("--options.mlp-sizes 8 x", "--options.mlp-sizes: expected a list", "'8 x'"),
+    "config after a list": ("--options.mlp-sizes 8 ant", "--options.mlp-sizes: expected a list", "'8 ant'"),
+    "empty list": ("--options.mlp-sizes", "options.mlp_sizes: expected at least one", "64"),
+    "second of two": ("--seed 1 --train.ppo.epochs x", "--train.ppo.epochs: expected an integer", "'x'"),
+    "zero": ("--seeds 0", "seeds: expected", "got 0; the nearest valid value is 1"),
+    "negative": ("--seed -1", "seed: expected", "got -1; the nearest valid value is 0"),
+    "outside": ("--options.fraction 1.5", "options.fraction: expected", "nearest valid value is 1"),
+    "not a number": ("--train.ppo.gamma nan", "train.ppo.gamma: expected", "got nan"),
+    "budget below one iteration": (
+        "half_cheetah --train.ticks 9",
+        "train.ticks: expected",
+        "nearest valid value is 16384",
+    ),
+    "option longer than rollout": (
+        "--options.length 9999",
+        "options.length: expected",
+        "train.ppo.rollout_length",
+    ),
+    "minibatch above rollout": (
+        "half_cheetah --train.ppo.minibatch-size 99999",
+        "train.ppo.minibatch_size",
+        "16384",
+    ),
+    "resume what": ("--resume", "--resume: expected", "--run-dir"),
+    "resume and overwrite": ("--resume --overwrite --run-dir x", "--resume and --overwrite", "at most one"),
+}
+
+
+@pytest.mark.parametrize(("args", "first", "second"), BAD_ARGUMENTS.values(), ids=BAD_ARGUMENTS)
+def test_bad_arguments_are_told_in_one_line(capfd, args, first, second):
+    assert main(args.split()) == 2
+    out, err = capfd.readouterr()
+    assert out == "" and err.count("\n") == 1 and err.startswith("taic_jax: error: ")
+    assert first in err and second in err
+    assert list(Path().iterdir()) == []
+
+
+def test_malformed_yaml_is_told_in_one_line(capfd):
+    Path("bad.yaml").write_text("train: [\n")
+    assert main(["bad.yaml", "--run-dir", "new"]) == 2
+    out, err = capfd.readouterr()
+    assert out == "" and err.count("\n") == 1 and "bad.yaml" in err and "line 2" in err
+    assert not Path("new").exists()
+
+
+@pytest.mark.parametrize(
+    "error", [ConfigError("of config"), ArtifactError("of\nartifact"), PermissionError(13, "no", "x")]
+)
+def test_mistakes_found_later_are_told_alike(monkeypatch, capsys, error):
+    monkeypatch.setattr(run, "execute", lambda command: (_ for _ in ()).throw(error))
+    assert main([]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_errors_of_the_program_keep_their_traceback(monkeypatch):
+    monkeypatch.setattr(run, "execute", lambda command: int("not a mistake of the user"))
+    with pytest.raises(ValueError, match="invalid literal"):
+        main([])
+
+
+def test_interrupt_exits_130_with_one_line(monkeypatch, capsys):
+    monkeypatch.setattr(run, "execute", lambda command: (_ for _ in ()).throw(KeyboardInterrupt))
+    assert main([]) == 130
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_help_shows_every_field_with_its_help(capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(["half_cheetah", "--help"])
+    out = " ".join(capsys.readouterr().out.split())
+    assert stop.value.code == 0
+    for part in (
+        "[OPTIONS] CONFIG",
+        "--run-dir DIR",
+        "--train.ppo.learning-rate FLOAT",
+        "half_cheetah",
+        "Discount per tick.",
+    ):
+        assert part in out
+
+
+def test_every_field_has_help():
+    for cls in CONFIG_CLASSES:
+        lines = inspect.getsource(cls).splitlines()
+        for field in dataclasses.fields(cls):
+            if not dataclasses.is_dataclass(field.type):
+                at = next(i for i, line in enumerate(lines) if line.startswith(f"    {field.name}: "))
+                assert lines[at + 1].startswith('    """'), f"{cls.__name__}.{field.name} has no help"
+
+
+PARSE_WITHOUT_JAX = """
+import sys
+from taic_jax import run
+run.execute = lambda command: print(sorted({"jax", "mujoco"} & sys.modules.keys()), command.config.seed)
+sys.exit(run.main(["half_cheetah", "--seed", "7"]))
+"""
+
+
+def test_arguments_are_parsed_before_jax_is_imported():
+    root = Path(run.__file__).parents[1]
+    done = subprocess.run([sys.executable, "-c", PARSE_WITHOUT_JAX], cwd=root, capture_output=True, text=True)
+    assert (done.stdout, done.returncode) == ("[] 7\n", 0), done.stderr
+
+
+def test_the_module_exits_with_the_code_of_main():
+    root = Path(run.__file__).parents[1]
+    command = [sys.executable, "-m", "taic_jax.run", "--seeds", "0"]
+    done = subprocess.run(command, cwd=root, capture_output=True, text=True)
+    assert done.returncode == 2 and done.stderr.count("\n") == 1 and done.stdout == ""
+
+
+def test_config_is_frozen():
+    with pytest.raises(AttributeError):
+        Config().seed = 3  # pyright: ignore[reportAttributeAccessIssue]

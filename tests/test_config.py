@@ -1,0 +1,202 @@
+"""Configurations: defaults are valid, files are read strictly, presets hold only differences."""
+
+import dataclasses
+import functools
+import itertools
+import math
+from pathlib import Path
+from typing import get_args, get_type_hints
+
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+
+from taic_jax import config as config_module
+from taic_jax.config import BOUNDS, CONFIG_CLASSES, Config, ConfigError, PPOConfig, validate, walk
+from taic_jax.config_io import closest, load_config, preset_names, to_yaml
+
+
+def write(tmp_path: Path, text: str) -> Path:
+    path = tmp_path / "experiment.yaml"
+    path.write_text(text)
+    return path
+
+
+def replace(config, name: str, value):
+    """Replace a field given by its dotted name."""
+    first, _, rest = name.partition(".")
+    return dataclasses.replace(
+        config, **{first: replace(getattr(config, first), rest, value) if rest else value}
+    )
+
+
+def test_defaults_are_valid():
+    validate(Config())
+
+
+@pytest.mark.parametrize("name", preset_names())
+def test_presets_load_are_valid_and_hold_only_differences(name):
+    preset = load_config(name)
+    validate(preset)
+    text = (Path(config_module.__file__).parent / "experiments/presets" / f"{name}.yaml").read_text()
+    defaults = yaml.safe_load(to_yaml(Config()))
+
+    def same(changes: dict, old: dict) -> list[str]:
+        nested = [same(changes[key], old[key]) for key in changes if isinstance(changes[key], dict)]
+        return [key for key in changes if changes[key] == old[key]] + list(itertools.chain(*nested))
+
+    assert same(yaml.safe_load(text), defaults) == []
+
+
+def test_yaml_names_every_field():
+    tree = yaml.safe_load(to_yaml(Config()))
+    for name, value in walk(Config()):
+        assert functools.reduce(dict.__getitem__, name.split("."), tree) == (
+            list(value) if isinstance(value, tuple) else value
+        )
+
+
+@given(st.data())
+def test_yaml_round_trip_of_any_values(tmp_path_factory, data):
+    config = Config()
+    for name, value in walk(config):
+        if type(value) is float:
+            config = replace(config, name, data.draw(st.floats(allow_nan=False, allow_infinity=False), name))
+        elif type(value) is int:
+            config = replace(config, name, data.draw(st.integers(), name))
+        elif isinstance(value, tuple):
+            config = replace(config, name, tuple(data.draw(st.lists(st.integers()), name)))
+    assert load_config(write(tmp_path_factory.mktemp("yaml"), to_yaml(config))) == config
+
+
+def test_a_partial_group_keeps_its_own_defaults(tmp_path):
+    # train.ppo starts from another log_std_init than PPOConfig() does.
+    loaded = load_config(write(tmp_path, "train: {ppo: {num_envs: 8}}"))
+    assert loaded == replace(Config(), "train.ppo.num_envs", 8)
+    assert loaded.train.ppo.log_std_init != PPOConfig().log_std_init
+
+
+def test_floats_may_be_written_as_yaml_misreads_them(tmp_path):
+    loaded = load_config(write(tmp_path, "train: {ppo: {learning_rate: 1e-3, gamma: 1}}"))
+    assert loaded.train.ppo.learning_rate == 1e-3
+    assert type(loaded.train.ppo.gamma) is float
+
+
+def test_yaml_anchors_and_merges_are_read(tmp_path):
+    loaded = load_config(
+        write(tmp_path, "collect: {ppo: &a {epochs: 3}}\ntrain: {ppo: {<<: *a, gamma: 0.5}}")
+    )
+    assert (loaded.train.ppo.epochs, loaded.train.ppo.gamma) == (3, 0.5)
+
+
+BAD_YAML = {
+    "unknown field": ("train: {ppo: {gama: 0.9}}", "train.ppo.gama", "train.ppo.gamma"),
+    "unknown group": ("trian: {ticks: 3}", "trian", "train"),
+    "field without its group": ("entropy_weight: 0.1", "entropy_weight", ".ppo.entropy_weight"),
+    "key that is not text": ("1: 2", "unknown field 1", "nearest"),
+    "group without fields": ("train: 3", "train: expected a mapping", "ticks"),
+    "empty group": ("train:", "train: expected a mapping", "got nothing"),
+    "bool for integer": ("seeds: true", "seeds: expected an integer, got True", "nearest is 1"),
+    "float for integer": ("seeds: 2.7", "seeds: expected an integer, got 2.7", "nearest is 3"),
+    "exponent for integer": ("collect: {ticks: 1e6}", "collect.ticks", "nearest is 1000000"),
+    "text for float": ("train: {ppo: {clip: wide}}", "train.ppo.clip: expected a number", "'wide'"),
+    "bool for float": ("train: {ppo: {clip: true}}", "train.ppo.clip: expected a number", "True"),
+    "text for bool": ("train: {flat: 'no'}", "train.flat: expected one of True, False", "'no'"),
+    "number for text": ("env: {name: 3}", "env.name: expected text", "got 3"),
+    "unknown choice": ("env: {backend: mujco}", "env.backend: expected one of auto", "nearest is mujoco"),
+    "list as choice": ("env: {backend: [auto]}", "env.backend: expected one of auto", "['auto']"),
+    "number for list": ("options: {mlp_sizes: 64}", "options.mlp_sizes: expected a list of integers", "64"),
+    "mapping for list": ("options: {mlp_sizes: {64: 1}}", "options.mlp_sizes", "{64: 1}"),
+    "float in list": ("options: {mlp_sizes: [64, 32.5]}", "options.mlp_sizes", "[64, 32.5]"),
+    "key twice": ("seed: 1\nseed: 2", "seed stands twice", "line 1"),
+    "empty file": ("", "expected a mapping", "got nothing"),
+    "list": ("[1, 2]", "expected a mapping", "[1, 2]"),
+    "malformed": ("train: [", "line 1", "expected"),
+    "tab": ("train:\n\tticks: 3", "line 2", "cannot start any token"),
+    "python object": ("seed: !!python/object/apply:os.getcwd []", "line 1", "constructor"),
+    "control character": ("seed: \x07", "experiment.yaml", "special characters"),
+}
+
+
+@pytest.mark.parametrize(("text", "first", "second"), BAD_YAML.values(), ids=BAD_YAML)
+def test_bad_yaml_is_told_in_one_line(tmp_path, text, first, second):
+    with pytest.raises(ConfigError) as error:
+        load_config(write(tmp_path, text))
+    message = str(error.value)
+    assert first in message and second in message and "\n" not in message
+
+
+def test_bad_sources_are_told_in_one_line(tmp_path):
+    (tmp_path / "folder.yaml").mkdir()
+    (tmp_path / "binary.yaml").write_bytes(b"\xff\x00")
+    for source, expected in {
+        "half_cheeta": "nearest is half_cheetah",
+        tmp_path / "folder.yaml": "directory",
+        tmp_path / "binary.yaml": "not text",
+        tmp_path / "missing.yaml": "No such file",
+    }.items():
+        with pytest.raises(ConfigError, match=expected) as error:
+            load_config(source)
+        assert "\n" not in str(error.value)
+
+
+IMPOSSIBLE = [
+    ("seeds", 0, 1),
+    ("seed", -1, 0),
+    ("collect.ticks", 100, 16 * 512),
+    ("train.ticks", 0, 1),
+    ("train.ppo.num_envs", 0, 1),
+    ("train.ppo.minibatch_size", 10_000, 16 * 512),
+    ("collect.ppo.gamma", 1.01, 1),
+    ("train.ppo.lambda_", -0.1, 0),
+    ("train.ppo.clip", 0.0, 1e-6),
+    ("train.ppo.learning_rate", -1e-3, 0),
+    ("train.ppo.entropy_weight", math.nan, 0),
+    ("train.ppo.max_grad_norm", math.inf, None),
+    ("train.ppo.hidden_sizes", (64, 0), 1),
+    ("options.mlp_sizes", (), 64),
+    ("options.length", 513, 512),
+    ("options.fraction", 1.5, 1),
+    ("evaluate.video_ticks", -1, 0),
+    ("env.num_threads", -2, 0),
+    ("train.ppo.lambda_", 1.5, 1),
+    ("train.ppo.log_std_init", 3.0, 2),
+    ("seed", 2**31, 2**31 - 1),
+]
+
+
+@pytest.mark.parametrize(("name", "value", "nearest"), IMPOSSIBLE)
+def test_impossible_values_name_field_value_and_nearest(name, value, nearest):
+    with pytest.raises(ConfigError) as error:
+        validate(replace(Config(), name, value))
+    message = str(error.value)
+    assert message.startswith(f"{name}: expected") and "\n" not in message
+    assert repr(value) in message or value == ()
+    assert nearest is None or message.endswith(f"the nearest valid value is {nearest}")
+
+
+def test_every_bound_belongs_to_a_field_and_holds_its_default():
+    ends = {name.rpartition(".")[2] for name, _ in walk(Config())}
+    assert BOUNDS.keys() <= ends
+
+
+def test_every_field_has_a_type_that_can_be_checked():
+    for cls in CONFIG_CLASSES:
+        for name, kind in get_type_hints(cls).items():
+            simple = kind in (int, float, bool, str) or kind == tuple[int, ...] or kind in CONFIG_CLASSES
+            assert simple or all(isinstance(choice, str) for choice in get_args(kind)), (
+                f"{cls.__name__}.{name}"
+            )
+
+
+def test_config_classes_are_all_there():
+    classes = {kind for kind in vars(config_module).values() if dataclasses.is_dataclass(kind)}
+    assert classes == set(CONFIG_CLASSES)
+
+
+def test_closest_prefers_the_same_last_part():
+    names = ["train.ppo.learning_rate", "options.learning_rate", "train.ppo.learning_rate_decay"]
+    assert closest("ppo.learning_rate", names) == "train.ppo.learning_rate"
+    assert closest("gamma", ["gamma_x.clip", "train.ppo.gamma"]) == "train.ppo.gamma"
+    assert closest("train.ppo.learning_rat", names) == "train.ppo.learning_rate"

@@ -1,0 +1,119 @@
+"""What a run measures: rows, events and their agreement after a resume."""
+
+import json
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from tensorboardX.proto.event_pb2 import Event  # pyright: ignore[reportAttributeAccessIssue]
+
+from taic_jax.logging import RunLogger, read_metrics
+
+
+def read_events(run_dir) -> dict[tuple[str, int], float]:
+    """Read all scalars: a record is 8 bytes of length, 4 of checksum, the event, 4 of checksum."""
+    scalars = {}
+    for path in (run_dir / "tensorboard").iterdir():
+        data = path.read_bytes()
+        while data:
+            end = 12 + int.from_bytes(data[:8], "little")
+            event = Event.FromString(data[12:end])
+            for value in event.summary.value:
+                assert (value.tag, event.step) not in scalars
+                scalars[value.tag, event.step] = value.simple_value
+            data = data[end + 4 :]
+    return scalars
+
+
+def test_rows_hold_one_number_per_seed_and_events_their_mean(tmp_path):
+    with RunLogger(tmp_path) as logger:
+        logger.log("train", 64, {"return": jnp.array([1.0, 3.0]), "ppo/entropy": 0.5, "episodes": 3})
+    (row,) = read_metrics(tmp_path / "metrics.jsonl")
+    assert row.pop("time") > 0
+    assert row == {
+        "stage": "train",
+        "ticks": 64,
+        "train/return": [1.0, 3.0],
+        "train/ppo/entropy": 0.5,
+        "train/episodes": 3,
+    }
+    expected = {("train/return", 64): 2.0, ("train/ppo/entropy", 64): 0.5, ("train/episodes", 64): 3.0}
+    assert read_events(tmp_path) == expected
+
+
+def test_what_is_not_finite_is_null(tmp_path):
+    with RunLogger(tmp_path) as logger:
+        logger.log("train", 1, {"some": np.array([np.nan, 2.0, np.inf]), "none": jnp.nan})
+    text = (tmp_path / "metrics.jsonl").read_text()
+    row = json.loads(text, parse_constant=pytest.fail)
+    assert (row["train/some"], row["train/none"]) == ([None, 2.0, None], None)
+    assert read_events(tmp_path) == {("train/some", 1): 2.0}
+
+
+def test_rows_are_on_disk_at_once(tmp_path):
+    with RunLogger(tmp_path) as logger:
+        logger.log("train", 1, {})
+        assert len(read_metrics(tmp_path / "metrics.jsonl")) == 1
+
+
+def log_two_stages(logger: RunLogger) -> None:
+    for stage in ("collect", "train"):
+        for ticks in (10, 20, 30):
+            logger.log(stage, ticks, {"return": float(ticks)})
+
+
+def test_truncate_drops_rows_and_events_after_the_checkpoint(tmp_path):
+    with RunLogger(tmp_path) as logger:
+        log_two_stages(logger)
+    (events,) = (tmp_path / "tensorboard").iterdir()
+    events.rename(events.with_name("events.out.tfevents.0.of-an-hour-ago"))
+    with RunLogger(tmp_path) as logger:
+        logger.truncate("train", 20)
+        logger.log("train", 30, {"return": 7.0})
+    kept = [(row["stage"], row["ticks"]) for row in read_metrics(tmp_path / "metrics.jsonl")]
+    assert kept == [
+        ("collect", 10),
+        ("collect", 20),
+        ("collect", 30),
+        ("train", 10),
+        ("train", 20),
+        ("train", 30),
+    ]
+    events = read_events(tmp_path)
+    assert len(events) == 6 and events["train/return", 30] == 7.0
+
+
+def test_truncate_to_nothing_drops_the_whole_stage(tmp_path):
+    with RunLogger(tmp_path) as logger:
+        log_two_stages(logger)
+        logger.truncate("collect", -1)
+    assert {row["stage"] for row in read_metrics(tmp_path / "metrics.jsonl")} == {"train"}
+    assert {name for name, _ in read_events(tmp_path)} == {"train/return"}
+
+
+def test_a_half_written_row_is_dropped(tmp_path):
+    path = tmp_path / "metrics.jsonl"
+    with RunLogger(tmp_path) as logger:
+        log_two_stages(logger)
+    path.write_text(path.read_text() + '{"stage": "train", "ti')
+    assert len(read_metrics(path)) == 6
+    with RunLogger(tmp_path) as logger:
+        logger.log("train", 40, {})
+    assert [row["ticks"] for row in read_metrics(path)] == [10, 20, 30, 10, 20, 30, 40]
+
+
+def test_progress_is_silent_when_not_a_terminal(tmp_path, capfd):
+    with RunLogger(tmp_path) as logger, logger.stage("train", 20):
+        logger.log("train", 20, {"return": 1.0})
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(("quiet", "shown"), [(False, True), (True, False)])
+def test_progress_on_a_terminal(tmp_path, capfd, monkeypatch, quiet, shown):
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    monkeypatch.setenv("COLUMNS", "120")
+    with RunLogger(tmp_path, quiet=quiet) as logger, logger.stage("train", 40, done=20):
+        logger.log("train", 30, {"return": np.array([1.0, 4.0])})
+    out, err = capfd.readouterr()
+    assert out == ""
+    assert ("train" in err and "ticks/s" in err and "return 2.5" in err) == shown

@@ -1,0 +1,64 @@
+"""Statistics over seeds, against numbers worked out by hand and by scipy."""
+
+import math
+
+import numpy as np
+from scipy import stats
+
+from taic_jax.statistics import bootstrap_interval, iqm, summarize
+
+
+def test_iqm_drops_the_lowest_and_highest_quarter():
+    # Of 8 sorted values the lowest 2 and the highest 2 go: (3 + 4 + 5 + 6) / 4 = 4.5.
+    assert iqm([8.0, -100.0, 3.0, 4.0, 5.0, 6.0, 1000.0, 2.0]) == 4.5
+    # Fewer than 4 values leave nothing to drop.
+    assert iqm([1.0, 2.0, 6.0]) == 3.0
+
+
+def test_iqm_works_along_an_axis():
+    values = np.arange(24.0).reshape(2, 3, 4)
+    np.testing.assert_allclose(iqm(values, axis=-1), values[..., 1:3].mean(-1))
+    np.testing.assert_allclose(iqm(values, axis=0), values.mean(0))
+
+
+def test_iqm_does_not_hide_a_diverged_seed():
+    # Sorting puts NaN last, where trimming would drop it.
+    assert math.isnan(iqm([1.0, 2.0, 3.0, math.nan]))
+
+
+def test_interval_golden_numbers():
+    values = [1396.0, 1278.0, 1514.0, 1450.0, 1322.0]
+    assert bootstrap_interval(values) == bootstrap_interval(values)
+    np.testing.assert_allclose(bootstrap_interval(values), (3922 / 3, 4478 / 3), rtol=1e-12)
+    assert bootstrap_interval(values, seed=1) != bootstrap_interval(values)
+
+
+def test_interval_agrees_with_scipy():
+    values = np.random.default_rng(0).normal(size=40)
+    peer = stats.bootstrap((values,), iqm, n_resamples=20_000, method="percentile", rng=1).confidence_interval
+    np.testing.assert_allclose(bootstrap_interval(values), peer, atol=0.03)
+
+
+def test_interval_narrows_with_less_confidence():
+    values = np.arange(20.0)
+    low, high = bootstrap_interval(values)
+    low_half, high_half = bootstrap_interval(values, confidence=0.5)
+    assert low < low_half < iqm(values) < high_half < high
+
+
+def test_interval_of_one_seed_is_unknown():
+    assert all(math.isnan(bound) for bound in bootstrap_interval([3.0]))
+
+
+def test_summary_is_json():
+    summary = summarize(np.array([1.0, 2.0, 3.0, 4.0, 100.0], np.float32))
+    assert summary == {"per_seed": [1, 2, 3, 4, 100], "mean": 22, "iqm": 3, "ci95": summary["ci95"]}
+    assert summary["ci95"][0] < 3 < summary["ci95"][1]
+    assert summarize([1.0]) == {"per_seed": [1], "mean": 1, "iqm": 1, "ci95": [None, None]}
+    assert summarize([1.0, math.inf]) == {
+        "per_seed": [1, None],
+        "mean": None,
+        "iqm": None,
+        "ci95": [None, None],
+    }
+    assert summarize([1.0, math.nan])["per_seed"] == [1, None]
