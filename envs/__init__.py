@@ -1,18 +1,21 @@
 """Tasks to learn: navigation, running robots and any Brax environment, behind the one interface `Env`."""
 
-if __name__ == "envs":  # a second copy of every class, and a collision with a user's own package of that name
-    raise ImportError("this folder is the package taic_jax.envs: write `import taic_jax.envs`, not `import envs`")
+if __name__ == "envs":  # would be a second copy of every class
+    raise ImportError("this folder is the package `taic_jax.envs`; import it by that name")
 
+import ctypes.util
 import functools
 import os
 import sys
 
-if sys.platform == "linux" and "DISPLAY" not in os.environ:
-    os.environ.setdefault("MUJOCO_GL", "egl")  # MuJoCo reads it when first imported; its default needs a display
+# MuJoCo chooses how to draw when it is first imported. Its own choice needs a display. EGL does not, but
+# where that library is missing, to ask for it would make the import fail.
+if sys.platform == "linux" and "DISPLAY" not in os.environ and ctypes.util.find_library("EGL"):
+    os.environ.setdefault("MUJOCO_GL", "egl")
 
 from taic_jax.envs.adapters import BRAX_PREFIX, BraxEnv
 from taic_jax.envs.base import Env, PhysicsState, State
-from taic_jax.envs.errors import UnknownNameError
+from taic_jax.envs.errors import RenderingError, UnknownNameError
 from taic_jax.envs.locomotion import ANT, HALF_CHEETAH, Locomotion
 from taic_jax.envs.navigation import Navigation
 from taic_jax.envs.wrappers import AutoReset, TimeLimit, Wrapper
@@ -24,6 +27,7 @@ __all__ = [
     "Locomotion",
     "Navigation",
     "PhysicsState",
+    "RenderingError",
     "State",
     "TimeLimit",
     "UnknownNameError",
@@ -33,7 +37,7 @@ __all__ = [
 ]
 
 _NAVIGATION = {
-    "nav2d": functools.partial(Navigation),
+    "nav2d": Navigation,
     "nav2d_random": functools.partial(Navigation, random_ends=True),
 }
 _ROBOTS = {"ant": ANT, "half_cheetah": HALF_CHEETAH}
@@ -44,9 +48,7 @@ def environment_names() -> tuple[str, ...]:
     return (*_NAVIGATION, *_ROBOTS)
 
 
-def make_env(
-    name: str, backend: str = "auto", *, num_threads: int | None = None, pipeline: str = "spring"
-) -> Env:
+def make_env(name: str, backend: str = "auto", *, num_threads: int | None = None, pipeline: str = "spring") -> Env:
     """Make a task by name, with its time limit.
 
     Args:

@@ -15,10 +15,15 @@ from jaxtyping import Float, Key
 from taic_jax.envs.base import Env, PhysicsState, State
 from taic_jax.envs.physics import make_physics
 
+_METRICS = ("forward_reward", "healthy_reward", "control_cost", "x_velocity")
+
 
 @dataclasses.dataclass(frozen=True)
 class Robot:
-    """What a running task takes from its body: the model, and the constants of Gym's reward, start and end."""
+    """What a running task takes from its body: the model, and the constants of Gym's reward, start and end.
+
+    `name` is the task's and the MJCF file's.
+    """
 
     name: str
     num_unobserved: int  # leading entries of qpos left out of obs: the place on the ground
@@ -47,8 +52,9 @@ ANT = Robot(
 class Locomotion(Env):
     """Run along x: reward = dx/dt + healthy_reward - control_cost |a|^2 each tick.
 
-    Observation: qpos without the place on the ground, then qvel. Positions are read from qpos, which, unlike a body's
-    world position, is current after a step. A simulation that diverges ends the episode in its last finite state.
+    Observation: qpos without the place on the ground, then qvel. Positions are read from qpos, which, unlike
+    the world positions of bodies, is current after a step. A simulation that diverges ends the episode in its
+    last finite state.
 
     Args:
       robot: the body's description.
@@ -77,15 +83,20 @@ class Locomotion(Env):
 
     def reset(self, key: Key[Array, ""]) -> State:
         """Start near the initial pose, with Gym's noise."""
-        key_qpos, key_qvel = jax.random.split(key)
-        noise = self.robot.reset_noise
-        qpos = self._init_qpos + jax.random.uniform(key_qpos, (self.model.nq,), minval=-noise, maxval=noise)
-        qvel = noise * jax.random.normal(key_qvel, (self.model.nv,))
-        physics = self.physics.init(qpos, qvel)
+        # One draw, turned normal for the velocities: hashing is most of a reset, to compile and to run.
+        nq, above_minus_one = self.model.nq, float(np.nextafter(np.float32(-1.0), np.float32(0.0)))
+        uniform = jax.random.uniform(key, (nq + self.model.nv,), minval=above_minus_one)
+        normal = math.sqrt(2.0) * jax.scipy.special.erfinv(uniform[nq:])
+        scale = self.robot.reset_noise
+        physics = self.physics.init(self._init_qpos + scale * uniform[:nq], scale * normal)
         zero, no = jnp.zeros(()), jnp.zeros((), bool)
-        metrics = {"forward_reward": zero, "healthy_reward": zero, "control_cost": zero, "x_velocity": zero}
         return State(
-            physics=physics, obs=self._observe(physics), reward=zero, terminated=no, truncated=no, metrics=metrics
+            physics=physics,
+            obs=self._observe(physics),
+            reward=zero,
+            terminated=no,
+            truncated=no,
+            metrics=dict.fromkeys(_METRICS, zero),
         )
 
     def step(self, state: State, action: Float[Array, " A"]) -> State:
@@ -124,7 +135,7 @@ class Locomotion(Env):
 
 
 def load_brax_model(name: str) -> mujoco.MjModel:
-    """Compile a robot from the MJCF in the installed brax package, found without importing brax (which is slow)."""
+    """Compile a robot from the MJCF in the brax package, found without importing brax (which is slow)."""
     (folder,) = importlib.util.find_spec("brax").submodule_search_locations
     spec = mujoco.MjSpec.from_file(str(Path(folder) / "envs" / "assets" / f"{name}.xml"))
     # MuJoCo deprecates the attribute `settotalmass`, with a warning; this is the replacement it asks for.
@@ -140,4 +151,3 @@ def initial_qpos(model: mujoco.MjModel) -> Float[np.ndarray, " nq"]:
     """Return the pose that the model's custom numeric `init_qpos` holds, else its default pose."""
     index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, "init_qpos")
     return model.qpos0 if index < 0 else model.numeric("init_qpos").data
-

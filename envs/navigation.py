@@ -15,7 +15,7 @@ GOAL_RADIUS = 0.5  # m
 CELL = 0.1  # m, raster from which free points are drawn
 START, GOAL = (1.0, 5.0), (9.0, 5.0)  # m, of the task with fixed ends
 
-# Rectangles (x_low, y_low, x_high, y_high) in m: a wall with gaps at y in [4, 6] and [8.5, 10], and two blocks.
+# Rectangles (x_low, y_low, x_high, y_high) in m: a wall with gaps at y in [4, 6] and [8.5, 10]; two blocks.
 # Walls are thicker than the 0.2 m of a tick, so nothing tunnels.
 BASE_MAP = np.array(
     [[4.8, 0.0, 5.2, 4.0], [4.8, 6.0, 5.2, 8.5], [2.0, 2.0, 3.0, 3.5], [7.0, 8.0, 8.0, 8.6]], np.float32
@@ -32,11 +32,11 @@ class NavigationState(struct.PyTreeNode):
 class Navigation(Env):
     """Reach the goal: reward +100 there, which ends the episode, and -1 at every other tick.
 
-    The action is the velocity; a move along one axis that would end inside an obstacle is cancelled, so the point
-    slides along walls. Observation: position / 5 - 1, and the goal alike where it varies.
+    The action is the velocity. A move along one axis that would end inside an obstacle is cancelled, so the
+    point slides along walls. Observation: position / 5 - 1, and the goal alike where it varies.
 
     Args:
-      walls: rectangles [R, 4] in m; a traced array will do, so a program can change the map without recompiling.
+      walls: rectangles [R, 4] in m; may be traced, so that a program can change the map without recompiling.
       random_ends: draw start and goal uniformly from free space each episode, and observe the goal.
     """
 
@@ -50,14 +50,14 @@ class Navigation(Env):
         self.observation_size = 4 if random_ends else 2
         self.random_ends = random_ends
         self.walls = jnp.asarray(walls)
-        self._cells, self._num_cells = free_cells(self.walls)
+        if random_ends:
+            self._cells, self._num_cells = free_cells(self.walls)
 
     def reset(self, key: Key[Array, ""]) -> State:
         """Put the point on its start."""
         position, goal = jnp.array(START), jnp.array(GOAL)
         if self.random_ends:
-            key_start, key_goal = jax.random.split(key)
-            position, goal = self._draw_free(key_start), self._draw_free(key_goal)
+            position, goal = jax.vmap(self._free_point)(jax.random.uniform(key, (2, 3)))
         physics = NavigationState(position=position, goal=goal)
         no = jnp.zeros((), bool)
         metrics = {"distance_to_goal": jnp.linalg.norm(goal - position), "success": jnp.zeros(())}
@@ -107,11 +107,10 @@ class Navigation(Env):
         points = [physics.position, physics.goal] if self.random_ends else [physics.position]
         return jnp.concatenate(points) / (ROOM / 2) - 1.0
 
-    def _draw_free(self, key: Key[Array, ""]) -> Float[Array, " 2"]:
-        """Draw a point uniformly from the free cells: a cell, then a place in it (no loop of rejections)."""
-        key_cell, key_place = jax.random.split(key)
-        cell = self._cells[jax.random.randint(key_cell, (), 0, self._num_cells)]
-        return cell + jax.random.uniform(key_place, (2,), maxval=CELL)
+    def _free_point(self, uniform: Float[Array, " 3"]) -> Float[Array, " 2"]:
+        """Map [0, 1)^3 to free space, uniformly and without rejections: a cell, then a place in it."""
+        cell = self._cells[(uniform[0] * self._num_cells).astype(jnp.int32)]
+        return cell + CELL * uniform[1:]
 
 
 def inside(point: Float[Array, " 2"], walls: Float[Array, "R 4"]) -> Bool[Array, ""]:
@@ -119,10 +118,11 @@ def inside(point: Float[Array, " 2"], walls: Float[Array, "R 4"]) -> Bool[Array,
     return jnp.any(jnp.all((walls[:, :2] <= point[None]) & (point[None] <= walls[:, 2:]), axis=1))
 
 
+@jax.jit
 def free_cells(walls: Float[Array, "R 4"]) -> tuple[Float[Array, "M 2"], Array]:
-    """Raster the room and list the lower corners of the M' <= M cells that touch no rectangle first, with M'."""
-    axis = jnp.arange(0.0, ROOM, CELL)
+    """Raster the room; return the cells' lower corners, those of free cells first, and how many are free."""
+    axis = CELL * jnp.arange(round(ROOM / CELL), dtype=jnp.float32)
     corners = jnp.stack(jnp.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
     low, high = walls[None, :, :2], walls[None, :, 2:]
     touches = jnp.any(jnp.all((corners[:, None] <= high) & (low <= corners[:, None] + CELL), axis=2), axis=1)
-    return corners[jnp.argsort(touches, stable=True)], jnp.sum(~touches)
+    return corners[jnp.argsort(touches, stable=True)], jnp.sum(~touches, dtype=jnp.float32)

@@ -1,5 +1,8 @@
 """Pictures of trajectories, drawn on the host: MuJoCo scenes, and the navigation room from above."""
 
+import os
+import sys
+
 import matplotlib.figure
 import matplotlib.patches
 import mujoco
@@ -8,25 +11,43 @@ from jax import Array
 from jaxtyping import Float, UInt8
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
+from taic_jax.envs.errors import RenderingError
+
 Frames = UInt8[np.ndarray, "T height width 3"]
 
 _FLOOR, _WALL, _GOAL, _POINT = "#f4f1ea", "#3d4451", "#3a9d5d", "#d1495b"
 
 
 def render_mujoco(model: mujoco.MjModel, qpos: Float[Array | np.ndarray, "T nq"], *, height: int, width: int) -> Frames:
-    """Draw a trajectory of poses, from the model's camera `track` where it has one."""
+    """Draw a trajectory of poses, from the model's camera `track` where it has one.
+
+    Raises:
+      RenderingError: if there is no OpenGL.
+    """
     model.vis.global_.offwidth = max(model.vis.global_.offwidth, width)
     model.vis.global_.offheight = max(model.vis.global_.offheight, height)
-    camera = max(mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, "track"), -1)
+    camera = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, "track")  # -1, a free one, if there is none
     data = mujoco.MjData(model)
     frames = []
-    with mujoco.Renderer(model, height, width) as renderer:
+    with _make_renderer(model, height, width) as renderer:
         for pose in np.asarray(qpos):
             data.qpos[:] = pose
             mujoco.mj_forward(model, data)
             renderer.update_scene(data, camera)
             frames.append(renderer.render())
     return np.stack(frames)
+
+
+def _make_renderer(model: mujoco.MjModel, height: int, width: int) -> mujoco.Renderer:
+    headless = sys.platform == "linux" and "DISPLAY" not in os.environ
+    context = getattr(mujoco, "GLContext", None)  # the kind was chosen when MuJoCo was imported
+    # Without a display, GLFW fails, and the second time ends the process: it must not be tried.
+    if context is None or (headless and context.__module__ == "mujoco.glfw"):
+        raise RenderingError("cannot draw MuJoCo scenes: without a display, install libegl1 and set MUJOCO_GL=egl")
+    try:
+        return mujoco.Renderer(model, height, width)
+    except (ImportError, RuntimeError, mujoco.FatalError) as error:
+        raise RenderingError(f"cannot draw MuJoCo scenes: {error}") from error
 
 
 def render_room(
@@ -40,7 +61,7 @@ def render_room(
     height: int,
     width: int,
 ) -> Frames:
-    """Draw a point's way through the room [0, size]^2: obstacles, start, goal and the path of the episode so far.
+    """Draw a point's way through the room [0, size]^2: obstacles, start, goal, and the episode's path so far.
 
     A move longer than `longest_move` is a reset: there a new path starts.
     """
@@ -51,12 +72,13 @@ def render_room(
     axes.set(xticks=[], yticks=[], facecolor=_FLOOR)
     for spine in axes.spines.values():
         spine.set(color=_WALL, linewidth=2)
-    for x_low, y_low, x_high, y_high in walls:
-        axes.add_patch(matplotlib.patches.Rectangle((x_low, y_low), x_high - x_low, y_high - y_low, color=_WALL))
-    target = axes.add_patch(matplotlib.patches.Circle((0, 0), goal_radius, color=_GOAL, alpha=0.6, linewidth=0))
+    for x, y, x_high, y_high in walls:
+        axes.add_patch(matplotlib.patches.Rectangle((x, y), x_high - x, y_high - y, color=_WALL))
+    target = axes.add_patch(matplotlib.patches.Circle((0, 0), goal_radius, color=_GOAL, alpha=0.6, lw=0))
     (path,) = axes.plot([], [], color=_POINT, linewidth=1.5, alpha=0.7, solid_capstyle="round")
     (start,) = axes.plot([], [], "o", markersize=6, markerfacecolor="white", markeredgecolor=_POINT)
     (point,) = axes.plot([], [], "o", markersize=7, color=_POINT, markeredgecolor="white", clip_on=False)
+    point.set_zorder(9)  # above the walls
 
     position, goal, begin, frames = np.asarray(position), np.asarray(goal), 0, []
     for t, here in enumerate(position):

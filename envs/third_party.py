@@ -1,4 +1,4 @@
-"""The one place that deals with what MJX and Brax do and this project does not: loose promotion and idle notes."""
+"""The one place for what MJX and Brax do and this project does not: loose promotion, and idle notes."""
 
 import contextlib
 import warnings
@@ -15,9 +15,9 @@ _NOTES = (
 
 @contextlib.contextmanager
 def third_party() -> Iterator[None]:
-    """Import or call MJX or Brax: promote dtypes and ranks as JAX does by default, and hide notes not for users.
+    """Import or call MJX or Brax: promote dtypes and ranks as JAX does by default, and hide idle notes.
 
-    MJX prints at its import that the optional Warp is not installed; that is why standard output is closed.
+    MJX prints at its import that the optional Warp is not installed; therefore standard output is closed.
     """
     with (
         jax.numpy_dtype_promotion("standard"),

@@ -36,7 +36,7 @@ class Wrapper(Env):
 
 
 class TimeLimit(Wrapper):
-    """Set `truncated` at the last allowed tick; the task's own end at that very tick stays `terminated` too."""
+    """Set `truncated` at the last allowed tick, besides `terminated` if the task ended at that very tick."""
 
     def __init__(self, env: Env, ticks: int):
         super().__init__(env)
@@ -56,9 +56,9 @@ class TimeLimit(Wrapper):
 class AutoReset(Wrapper):
     """Start the next episode, from a fresh key, in the tick that ends one.
 
-    That tick's reward, terminated, truncated and metrics are kept, and the observation it ended in is `final_obs`;
-    physics, obs and tick are already the next episode's. Ticks in which no episode of the whole batch ends compute
-    no reset, under any nesting of vmap.
+    That tick's reward, terminated, truncated and metrics are kept, and `final_obs` is the observation it
+    ended in; physics, obs and tick are already the next episode's. Ticks in which no episode of the whole
+    batch ends compute no reset, under any nesting of vmap.
     """
 
     def __init__(self, env: Env):
@@ -81,7 +81,7 @@ class AutoReset(Wrapper):
         return state.replace(physics=physics, obs=obs, tick=tick, key=key, final_obs=state.obs)
 
     def _restart_ended(self, ended: Array, key: Array, running: Any) -> Any:
-        """Replace what runs by a fresh start where it ended; all arguments have the leading axes of `ended`."""
+        """Put a fresh start where an episode ended; all arguments have the leading axes of `ended`."""
 
         def restart(ended: Array, key: Array, running: Any) -> Any:
             start = self.env.reset(key)
@@ -95,7 +95,9 @@ class AutoReset(Wrapper):
     def _restart_batched(self, axis_size: int, batched: Any, *args: Any) -> tuple[Any, Any]:
         """Under vmap, ask once for the whole batch: a plain vmap would turn the condition into a select."""
         args = jax.tree.map(
-            lambda x, has_axis: x if has_axis else jnp.broadcast_to(x, (axis_size, *x.shape)), args, tuple(batched)
+            lambda x, has_axis: x if has_axis else jnp.broadcast_to(x, (axis_size, *x.shape)),
+            args,
+            tuple(batched),
         )
         running = self._restart(*args)
         return running, jax.tree.map(lambda _: True, running)

@@ -94,9 +94,7 @@ def _errors_in_one_line(path: Path) -> Iterator[None]:
     try:
         yield
     except (ValueError, OSError, AttributeError):
-        raise ArtifactError(
-            f"{path}: expected an artifact, got files of another kind or damaged ones"
-        ) from None
+        raise ArtifactError(f"{path}: expected an artifact, got files of another kind or damaged ones") from None
 
 
 def _named(tree: Any) -> dict[str, Any]:

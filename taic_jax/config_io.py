@@ -39,9 +39,7 @@ def to_yaml(config: Config) -> str:
 
 def preset_names() -> list[str]:
     """List the presets that ship with the package."""
-    return sorted(
-        file.name.removesuffix(".yaml") for file in _presets().iterdir() if file.name.endswith(".yaml")
-    )
+    return sorted(file.name.removesuffix(".yaml") for file in _presets().iterdir() if file.name.endswith(".yaml"))
 
 
 def mistyped(name: str, kind: Any, value: Any) -> ConfigError:
@@ -83,17 +81,13 @@ def _read_text(source: str) -> str:
     if not source.endswith((".yaml", ".yml")) and "/" not in source:
         if source not in preset_names():
             nearest = closest(source, preset_names())
-            raise ConfigError(
-                f"unknown preset {source!r}; the nearest is {nearest} (a file's name ends in .yaml)"
-            )
+            raise ConfigError(f"unknown preset {source!r}; the nearest is {nearest} (a file's name ends in .yaml)")
         return (_presets() / f"{source}.yaml").read_text()
     try:
         return Path(source).read_text()
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "it is not text"
-        raise ConfigError(
-            f"{source}: expected a YAML file or one of {', '.join(preset_names())}: {reason}"
-        ) from None
+        raise ConfigError(f"{source}: expected a YAML file or one of {', '.join(preset_names())}: {reason}") from None
 
 
 def _override(default: Any, changes: Any, prefix: str = "") -> Any:

@@ -11,11 +11,10 @@ from taic_jax.envs.base import Env, State
 from taic_jax.envs.wrappers import AutoReset
 from taic_jax.rl.ppo import Agent
 from taic_jax.rl.rollout import Rollout, rollout, start
+from taic_jax.types import Scalar
 
 
-def evaluate(
-    env: Env, agent: Agent, key: Key[Array, ""], episodes: int, deterministic: bool = False
-) -> dict[str, Array]:
+def evaluate(env: Env, agent: Agent, key: Key[Array, ""], episodes: int, exploration: Scalar = 1.0) -> dict[str, Array]:
     """Return means over `episodes` whole episodes, one per environment, each from a fresh start.
 
     Args:
@@ -23,13 +22,13 @@ def evaluate(
       agent: what acts.
       key: consumed.
       episodes: number of episodes.
-      deterministic: take the mean option instead of drawing one.
+      exploration: scale of the policy's noise; 0 takes its mean options.
 
     Returns:
       Scalars: `return`, `length` in ticks, and of every metric of the task its mean over the ticks of an episode
       (`mean/NAME`) and its value at the last tick (`final/NAME`).
     """
-    ticks = _run(env, agent, key, episodes, env.episode_length, deterministic, _metrics)
+    ticks = _run(env, agent, key, episodes, env.episode_length, exploration, _metrics)
     done = (ticks.terminated | ticks.truncated).astype(jnp.float32)
     first = (jnp.cumsum(done, axis=0) - done == 0).astype(jnp.float32)
     length = jnp.sum(first, axis=0)
@@ -42,7 +41,7 @@ def evaluate(
 
 def record(env: Env, agent: Agent, key: Key[Array, ""], ticks: int) -> Any:
     """Return `ticks` ticks of physics [T, ...] of one environment under the mean options, for `env.render`."""
-    run = _run(env, agent, key, 1, ticks, True, _physics)
+    run = _run(env, agent, key, 1, ticks, 0.0, _physics)
     return jax.tree.map(lambda x: x[:, 0], run.extras)
 
 
@@ -60,10 +59,10 @@ def _run(
     key: Key[Array, ""],
     num_envs: int,
     ticks: int,
-    deterministic: bool,
+    exploration: Scalar,
     keep: Callable[[State], Any],
 ) -> Rollout:
     key_start, key_rollout = jax.random.split(key)
     env = AutoReset(env)
     running = start(env, agent.executor, num_envs, key_start)
-    return rollout(env, agent.executor, agent.decide(deterministic), running, key_rollout, ticks, keep)[1]
+    return rollout(env, agent.executor, agent.decide(exploration), running, key_rollout, ticks, keep)[1]

@@ -6,10 +6,12 @@ iteration it was in, and a resumed one writes the same files again.
 
 import json
 import os
+import zipfile
 from functools import partial
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Key
 
@@ -31,9 +33,7 @@ def as_experience(ticks: Rollout, proprioceptive_size: int) -> Experience:
     return Experience(ticks.obs[..., :proprioceptive_size], ticks.action, ticks.reward, done)
 
 
-def collect(
-    config: CollectConfig, env: Env, key: Key[Array, ""]
-) -> tuple[ppo.Agent, dict[str, Array], Experience]:
+def collect(config: CollectConfig, env: Env, key: Key[Array, ""]) -> tuple[ppo.Agent, dict[str, Array], Experience]:
     """Train flat PPO in `env` and keep its newest `config.capacity` ticks; pure, so keys may be vmapped.
 
     Returns the agent, the metrics of every iteration, and the experience [T, B, ...].
@@ -41,12 +41,14 @@ def collect(
     config = as_arrays(config)
     executor = IdentityExecutor(env.action_size)
     count = ppo.num_iterations(config.ppo, config.ticks)
-    kept = min(num_blocks(config), count)
+    late = min(num_blocks(config), count)
     step = partial(_iteration, config, env, executor, count)
-    state = ppo.init(config.ppo, env, executor, key)
-    state, (early, _) = jax.lax.scan(partial(step, False), state, None, count - kept)
-    state, (late, blocks) = jax.lax.scan(partial(step, True), state, None, kept)
-    metrics = jax.tree.map(lambda a, b: jax.numpy.concatenate([a, b]), early, late)
+    state, metrics = ppo.init(config.ppo, env, executor, key), []
+    if late < count:  # what is too early to be kept
+        state, (early, _) = jax.lax.scan(partial(step, False), state, None, count - late)
+        metrics.append(early)
+    state, (last, blocks) = jax.lax.scan(partial(step, True), state, None, late)
+    metrics = jax.tree.map(lambda *parts: jnp.concatenate(parts), *metrics, last)
     experience = jax.tree.map(lambda x: x.reshape((-1, *x.shape[2:])), blocks)
     return ppo.as_agent(config.ppo, executor, state), metrics, experience
 
@@ -93,7 +95,7 @@ class ExperienceStore:
         path = self.folder / f"{iteration:06d}.npz"
         temporary = path.with_suffix(".tmp")
         with temporary.open("wb") as file:
-            np.savez(file, **{name: np.asarray(getattr(block, name)) for name in FIELDS})
+            np.savez(file, obs=block.obs, action=block.action, reward=block.reward, done=block.done)
         os.replace(temporary, path)
         (self.folder / f"{iteration - self.capacity:06d}.npz").unlink(missing_ok=True)
 
@@ -122,9 +124,9 @@ def read_experience(folder: Path, seed: int) -> Experience:
     blocks: dict[str, list[np.ndarray]] = {name: [] for name in FIELDS}
     for path in paths:
         try:
-            with np.load(path, allow_pickle=False) as block:
+            with path.open("rb") as file, np.load(file, allow_pickle=False) as block:
                 for name in FIELDS:
                     blocks[name].append(block[name][seed])
-        except (OSError, ValueError, KeyError, IndexError) as error:
+        except (OSError, EOFError, ValueError, KeyError, IndexError, zipfile.BadZipFile) as error:
             raise ArtifactError(f"{path} is no block of experience with seed {seed}: {error}") from None
     return Experience(**{name: np.concatenate(arrays) for name, arrays in blocks.items()})

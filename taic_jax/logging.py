@@ -12,7 +12,7 @@ import shutil
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import tensorboardX
@@ -20,6 +20,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 Row = dict[str, Any]
+Unit = Literal["ticks", "steps"]
 
 
 class RunLogger:
@@ -60,9 +61,9 @@ class RunLogger:
         self._close()
 
     @contextlib.contextmanager
-    def stage(self, name: str, total_ticks: int, done: int = 0) -> Iterator[None]:
-        """Show the progress of a stage of `total_ticks`, of which `done` were ticked before a resume."""
-        self._task = self._progress.add_task(name, total=total_ticks, completed=done, speed="", result="")
+    def stage(self, name: str, total: int, done: int = 0) -> Iterator[None]:
+        """Show the progress of a stage of `total` ticks or steps, of which `done` were made before a resume."""
+        self._task = self._progress.add_task(name, total=total, completed=done, speed="", result="")
         self._started, self._done = time.monotonic(), done
         try:
             yield
@@ -70,26 +71,27 @@ class RunLogger:
             self._progress.stop_task(self._task)
             self._task = None
 
-    def log(self, stage: str, ticks: int, metrics: Mapping[str, Any]) -> None:
+    def log(self, stage: str, count: int, metrics: Mapping[str, Any], unit: Unit = "ticks") -> None:
         """Write one row.
 
         Args:
             stage: name of the stage; each metric is written as `stage/name`.
-            ticks: interactions so far in this stage, per seed.
+            count: interactions, or gradient steps, so far in this stage, per seed.
             metrics: numbers, or arrays of shape [K] with one number per seed.
+            unit: what `count` counts, and its name in the row.
         """
-        row: Row = {"stage": stage, "ticks": ticks, "time": round(time.time(), 3)}
+        row: Row = {"stage": stage, unit: count, "time": round(time.time(), 3)}
         row |= {f"{stage}/{name}": _to_json(value) for name, value in metrics.items()}
         self._file.write(json.dumps(row, allow_nan=False) + "\n")
         self._file.flush()
         self._write_events(row)
         if self._task is not None:
-            self._show(self._task, row)
+            self._show(self._task, row, unit)
 
-    def truncate(self, stage: str, ticks: int) -> None:
-        """Drop the rows of a stage after `ticks`, which a resumed run will write again; -1 drops them all."""
+    def truncate(self, stage: str, count: int) -> None:
+        """Drop the rows of a stage after `count`, which a resumed run will write again; -1 drops them all."""
         rows = read_metrics(self._path)
-        kept = [row for row in rows if row["stage"] != stage or row["ticks"] <= ticks]
+        kept = [row for row in rows if row["stage"] != stage or _count(row) <= count]
         if len(kept) == len(rows):
             return
         self._close()
@@ -112,15 +114,16 @@ class RunLogger:
     def _write_events(self, row: Row) -> None:
         for name, value in row.items():
             if "/" in name and (mean := _mean(value)) is not None:
-                self._events.add_scalar(name, mean, row["ticks"], walltime=row["time"])
+                self._events.add_scalar(name, mean, _count(row), walltime=row["time"])
 
-    def _show(self, task: TaskID, row: Row) -> None:
+    def _show(self, task: TaskID, row: Row, unit: Unit) -> None:
         seconds = max(time.monotonic() - self._started, 1e-9)
+        seeds = max(len(value) if isinstance(value, list) else 1 for value in row.values())
         result = _mean(row.get(f"{row['stage']}/return"))
         self._progress.update(
             task,
-            completed=row["ticks"],
-            speed=f"{(row['ticks'] - self._done) / seconds:,.0f} ticks/s",
+            completed=row[unit],
+            speed=f"{seeds * (row[unit] - self._done) / seconds:,.0f} {unit}/s",
             result="" if result is None else f"return {result:.1f}",
         )
 
@@ -128,6 +131,10 @@ class RunLogger:
 def read_metrics(path: Path) -> list[Row]:
     """Read the rows of a metrics.jsonl; a half-written last one is left out."""
     return [json.loads(line) for line in path.read_text().splitlines(keepends=True) if line.endswith("\n")]
+
+
+def _count(row: Row) -> int:
+    return row["ticks"] if "ticks" in row else row["steps"]
 
 
 def _drop_half_row(path: Path) -> None:

@@ -1,6 +1,7 @@
 """The policy's networks: a Gaussian actor over options and a critic, three-layer MLPs (paper, §4)."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import distrax
 import flax.linen as nn
@@ -8,6 +9,13 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float, Key
+
+from taic_jax.types import Scalar
+
+
+def apply(module: nn.Module, params: Any, *args: Any, **kwargs: Any) -> Any:
+    """Return `module.apply(params, ...)`, typed loosely: Flax would name mutated variables too, and none are."""
+    return module.apply(params, *args, **kwargs)
 
 
 class MLP(nn.Module):
@@ -31,8 +39,8 @@ class MLP(nn.Module):
 class PolicyParams(struct.PyTreeNode):
     """Parameters of actor and critic; `log_std` [D] does not depend on the state."""
 
-    actor: dict
-    critic: dict
+    actor: Any
+    critic: Any
     log_std: Array
 
 
@@ -50,20 +58,18 @@ class Policy(struct.PyTreeNode):
     def _critic(self) -> MLP:
         return MLP((*self.hidden_sizes, 1))
 
-    def init(self, key: Key[Array, ""], observation_size: int, log_std_init: Float[Array, ""]) -> PolicyParams:
+    def init(self, key: Key[Array, ""], observation_size: int, log_std_init: Scalar) -> PolicyParams:
         """Return fresh parameters whose mean option is near zero."""
         key_actor, key_critic = jax.random.split(key)
         obs = jnp.zeros(observation_size)
-        log_std = jnp.zeros(self.option_size) + log_std_init[None]
+        log_std = jnp.full(self.option_size, log_std_init, jnp.float32)
         return PolicyParams(self._actor.init(key_actor, obs), self._critic.init(key_critic, obs), log_std)
 
-    def distribution(
-        self, params: PolicyParams, obs: Float[Array, "*batch S"]
-    ) -> distrax.MultivariateNormalDiag:
+    def distribution(self, params: PolicyParams, obs: Float[Array, "*batch S"]) -> distrax.MultivariateNormalDiag:
         """Return pi(o|s) for normalised observations."""
-        mean = self._actor.apply(params.actor, obs)
+        mean = apply(self._actor, params.actor, obs)
         return distrax.MultivariateNormalDiag(mean, jnp.broadcast_to(jnp.exp(params.log_std), mean.shape))
 
     def value(self, params: PolicyParams, obs: Float[Array, "*batch S"]) -> Float[Array, "*batch"]:
         """Return V(s) for normalised observations."""
-        return self._critic.apply(params.critic, obs)[..., 0]
+        return apply(self._critic, params.critic, obs)[..., 0]

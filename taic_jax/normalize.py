@@ -1,10 +1,17 @@
 """Running statistics of observations and rewards, on top of Brax's maintained implementation."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
-from brax.training.acme import running_statistics
 from flax import struct
 from jaxtyping import Array, Bool, Float
+
+from taic_jax.envs.third_party import third_party
+from taic_jax.types import Scalar
+
+with third_party():
+    from brax.training.acme import running_statistics
 
 Statistics = running_statistics.RunningStatisticsState
 """Mean and standard deviation of everything seen so far, with a 64-bit count."""
@@ -24,8 +31,10 @@ def update(statistics: Statistics, batch: Float[Array, "..."]) -> Statistics:
 
 def normalize(statistics: Statistics, x: Float[Array, "..."], clip: float = 10.0) -> Float[Array, "..."]:
     """Return (x - mean) / std, clipped to `clip` standard deviations."""
+    mean: Any = statistics.mean
+    std: Any = statistics.std
     with jax.numpy_rank_promotion("allow"):
-        return jnp.clip((x - statistics.mean) / statistics.std, -clip, clip)
+        return jnp.clip((x - mean) / std, -clip, clip)
 
 
 class RewardScale(struct.PyTreeNode):
@@ -41,7 +50,7 @@ def init_reward_scale(num_envs: int) -> RewardScale:
 
 
 def scale_rewards(
-    scale: RewardScale, reward: Float[Array, "T B"], done: Bool[Array, "T B"], gamma: Float[Array, ""]
+    scale: RewardScale, reward: Float[Array, "T B"], done: Bool[Array, "T B"], gamma: Scalar
 ) -> tuple[RewardScale, Float[Array, "T B"]]:
     """Divide rewards by the standard deviation of the discounted return, the new ticks taken in first."""
 
@@ -53,5 +62,6 @@ def scale_rewards(
     with jax.numpy_rank_promotion("allow"):
         discounted_return, totals = jax.lax.scan(tick, scale.discounted_return, (reward, done))
         statistics = update(scale.statistics, totals)
-        scaled = jnp.clip(reward / jnp.maximum(statistics.std, 1e-4), -10.0, 10.0)
+        std: Any = statistics.std
+        scaled = jnp.clip(reward / jnp.maximum(std, 1e-4), -10.0, 10.0)
     return RewardScale(statistics, discounted_return), scaled

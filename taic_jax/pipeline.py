@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -17,6 +18,7 @@ from taic_jax.config import Config, ConfigError, PPOConfig
 from taic_jax.config_io import to_yaml
 from taic_jax.envs import make_env
 from taic_jax.envs.base import Env
+from taic_jax.envs.errors import RenderingError
 from taic_jax.evaluate import evaluate
 from taic_jax.experience import ExperienceStore, as_experience, num_blocks, read_experience
 from taic_jax.logging import RunLogger
@@ -25,7 +27,7 @@ from taic_jax.options.dataset import Experience, make_dataset
 from taic_jax.options.execution import Executor, IdentityExecutor, make_executor
 from taic_jax.options.model import OptionModel, make_networks
 from taic_jax.rl import ppo
-from taic_jax.stage import Run, drive
+from taic_jax.stage import CLOCK, Clock, Run, drive
 from taic_jax.summary import as_summary, write_video
 from taic_jax.types import as_arrays
 
@@ -66,11 +68,10 @@ class Level:
 
     def assess(self, key: Array, state: ppo.TrainState, *model: OptionModel) -> dict[str, dict[str, Array]]:
         """Evaluate the policy as it explores, and taking its mean options."""
-        agent = self.agent(state, *model)
-        return {
-            "return": evaluate(self.env, agent, key, self.episodes),
-            "return_mean_option": evaluate(self.env, agent, key, self.episodes, deterministic=True),
-        }
+        both = partial(evaluate, self.env, self.agent(state, *model), key, self.episodes)
+        results = jax.vmap(both)(jnp.array([1.0, 0.0]))
+        modes = ("return", "return_mean_option")
+        return {mode: jax.tree.map(lambda x, i=i: x[i], results) for i, mode in enumerate(modes)}
 
     def agent(self, state: ppo.TrainState, *model: OptionModel) -> ppo.Agent:
         """Return what acts."""
@@ -97,16 +98,20 @@ def run_pipeline(config: Config, run_dir: Path, *, resume: bool = False, overwri
     # Seed k of a run is seed 0 of a run whose seed is k more.
     keys = jnp.stack([jax.random.key(config.seed + k) for k in range(config.seeds)])
     with RunLogger(run_dir) as logger:
-        run = Run(as_arrays(config), keys, run_dir, logger)
+        run = Run(as_arrays(config), keys, run_dir, logger, Clock.load(run_dir / CLOCK))
+        logger.truncate("evaluate", -1)
         collector = collect(run, source)
         model = learn(run, source)
         taic = train_over_options(run, env, model)
         # Where experience comes from the task itself, the collector is the flat baseline.
         flat = collector if source is env else train_flat(run, env) if config.train.flat else None
-        write_video(run, env, taic.agent)
     methods = {"taic": taic, **({"flat": flat} if flat else {})}
     summary = as_summary(run, {name: {"first": x.first, "last": x.last} for name, x in methods.items()})
     (run_dir / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+    try:
+        write_video(run, env, taic.agent)
+    except RenderingError as error:  # nothing else depends on it, and all results are saved
+        print(f"taic_jax: no video: {error}", file=sys.stderr)
     return summary
 
 
@@ -116,10 +121,10 @@ def make_envs(config: Config) -> tuple[Env, Env]:
     Raises:
       ConfigError: options learnt in one do not fit the other.
     """
-    options = {"backend": config.env.backend, "pipeline": config.env.pipeline}
-    options["num_threads"] = config.env.num_threads or None
-    env = make_env(config.env.name, **options)
-    source = make_env(config.collect.env, **options) if config.collect.env else env
+    wanted = config.env
+    make = partial(make_env, num_threads=wanted.num_threads or None, pipeline=wanted.pipeline)
+    env = make(wanted.name, wanted.backend)
+    source = make(config.collect.env, wanted.backend) if config.collect.env else env
     bodies = [(e.proprioceptive_size, e.action_size) for e in (source, env)]
     if bodies[0] != bodies[1]:
         raise ConfigError(

@@ -4,6 +4,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from taic_jax.types import Scalar
+
 
 def semi_markov_advantages(
     *,
@@ -14,8 +16,8 @@ def semi_markov_advantages(
     value: Float[Array, "T B"],
     final_value: Float[Array, "T B"],
     last_value: Float[Array, " B"],
-    gamma: Float[Array, ""],
-    lambda_: Float[Array, ""],
+    gamma: Scalar,
+    lambda_: Scalar,
 ) -> Float[Array, "T B"]:
     """Return the advantage of deciding at each tick; only entries at decisions are meaningful.
 

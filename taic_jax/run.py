@@ -44,8 +44,8 @@ def main(args: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code: 0, 2 for a mistake of the user, or 130 when interrupted."""
     try:
         execute(parse(sys.argv[1:] if args is None else args))
-    except KeyboardInterrupt:
-        print("taic_jax: interrupted; --resume continues from the last checkpoint", file=sys.stderr)
+    except KeyboardInterrupt as stop:
+        print("taic_jax: interrupted;", *stop.args, file=sys.stderr)
         return 130
     except BrokenPipeError:  # the reader, such as head, has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -89,7 +89,10 @@ def execute(command: Command) -> None:
         return
     name = f"{Path(command.source).stem}-{time.strftime('%Y%m%d-%H%M%S')}"
     run_dir = command.run_dir or Path("runs") / name
-    run_pipeline(command.config, run_dir, resume=command.resume, overwrite=command.overwrite)
+    try:
+        run_pipeline(command.config, run_dir, resume=command.resume, overwrite=command.overwrite)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(f"--resume --run-dir {run_dir} continues from the last checkpoint") from None
     print(run_dir / "summary.json")
 
 
@@ -120,9 +123,7 @@ def _explain(args: Sequence[str]) -> ConfigError:
                 tyro.cli(Command, args=[option, *values])
         except SystemExit:
             return mistyped(option, known[name], " ".join(values) or None)
-    return ConfigError(
-        f"unexpected argument in {' '.join(args)!r}; expected one CONFIG and options, see --help"
-    )
+    return ConfigError(f"unexpected argument in {' '.join(args)!r}; expected one CONFIG and options, see --help")
 
 
 def _options(args: Sequence[str]) -> Iterator[tuple[str, list[str]]]:

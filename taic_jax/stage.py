@@ -1,8 +1,9 @@
 """What every stage of the main job is driven by: compile once, step, log, checkpoint, resume."""
 
+import json
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -16,6 +17,7 @@ from taic_jax.logging import RunLogger
 S = TypeVar("S")
 STAGES = ("collect", "learn", "train", "flat", "evaluate", "video")
 CHECKPOINT_SECONDS = 30.0
+CLOCK = "clock.json"
 
 
 @dataclass
@@ -26,6 +28,15 @@ class Clock:
     run: float = 0.0
     ticks: int = 0
 
+    def save(self, path: Path) -> None:
+        """Write to a JSON file, so that a resumed run counts on."""
+        path.write_text(json.dumps(asdict(self)) + "\n")
+
+    @classmethod
+    def load(cls, path: Path) -> "Clock":
+        """Read what `save` wrote; without a file, start at zero."""
+        return cls(**json.loads(path.read_text())) if path.exists() else cls()
+
 
 @dataclass(frozen=True)
 class Run:
@@ -35,7 +46,7 @@ class Run:
     keys: jax.Array
     dir: Path
     logger: RunLogger
-    clock: Clock = field(default_factory=Clock)
+    clock: Clock
 
     def stage_keys(self, stage: str) -> jax.Array:
         """Return the seeds' keys [K] of one stage; a seed's key does not depend on the number of seeds."""
@@ -81,16 +92,17 @@ def drive(
     if first == num_steps:
         return state
     compiled = run.compile(step, state, *args, donate=True)
-    start = saved = time.perf_counter()
-    with run.logger.stage(stage, num_steps * unit):
+    saved = time.perf_counter()
+    with run.logger.stage(stage, num_steps * unit, done=first * unit):
         for index in range(first, num_steps):
             state, metrics, extra = compiled(state, *args)
-            run.logger.log(stage, (index + 1) * unit, jax.device_get(metrics))
+            run.logger.log(stage, (index + 1) * unit, jax.device_get(metrics), "ticks" if ticks else "steps")
             if after is not None:
                 after(index, extra)
+            run.clock.ticks += ticks
             if time.perf_counter() - saved > CHECKPOINT_SECONDS or index + 1 == num_steps:
                 checkpoints.save(index + 1, state)
+                run.clock.run += time.perf_counter() - saved
+                run.clock.save(run.dir / CLOCK)
                 saved = time.perf_counter()
-    run.clock.run += time.perf_counter() - start
-    run.clock.ticks += (num_steps - first) * ticks
     return state

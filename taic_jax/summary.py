@@ -53,7 +53,7 @@ def as_summary(run: Run, methods: Mapping[str, Mapping[str, Any]]) -> dict[str, 
         "ticks_per_second": clock.ticks / clock.run if clock.run else None,
         "seconds": {"compile": clock.compile, "run": clock.run},
         "methods": {name: _method(**evaluations) for name, evaluations in methods.items()},
-        "versions": {name: metadata.version(name) for name in PACKAGES},
+        "versions": {name: _version(name) for name in PACKAGES},
         "commit": commit(),
     }
 
@@ -66,6 +66,14 @@ def _method(first: Mapping[str, Mapping], last: Mapping[str, Mapping]) -> dict[s
         result[mode]["first_per_seed"] = np.asarray(first[mode]["return"], float).tolist()
     result["metrics"] = {name: summarize(values) for name, values in last["return_mean_option"].items()}
     return result
+
+
+def _version(name: str) -> str | None:
+    """Return the installed version, or None: a bare checkout of this package has none."""
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return None
 
 
 def commit() -> str | None:
@@ -93,4 +101,3 @@ def write_webp(path: Path, frames: np.ndarray, dt: float) -> None:
     every = max(round(0.04 / dt), 1)
     images = [Image.fromarray(frame) for frame in frames[::every]]
     images[0].save(path, save_all=True, append_images=images[1:], duration=round(1000 * dt * every), loop=0)
-

@@ -10,11 +10,13 @@ from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Float
 
 from taic_jax import config
 
 Tree = TypeVar("Tree")
+Scalar = Float[Array, ""] | float
+"""A leaf of the config: a float as it is read, an array once `as_arrays` was applied or a sweep vmaps it."""
 
 
 def _register(cls: type) -> None:

@@ -1,11 +1,23 @@
 """Strict modes for every test: no silent promotion of dtypes or ranks."""
 
+import os
+from collections.abc import Callable
+
+import beartype
 import hypothesis
 import jax
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
+# Programs are tiny here and run once or twice, so nearly all the time goes into compiling them.
+jax.config.update("jax_disable_most_optimizations", True)
+os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_use_fusion_emitters=false"
 
 # The first example of a property compiles, the others do not: a deadline would only measure that.
 hypothesis.settings.register_profile("taic_jax", deadline=None, max_examples=25)
 hypothesis.settings.load_profile("taic_jax")
+
+
+def check_functions(function: Callable) -> Callable:
+    """Check the types and shapes of a call, but for a dataclass's `__init__`: JAX rebuilds trees with placeholders."""
+    return function if function.__name__ == "__init__" else beartype.beartype(function)

@@ -73,9 +73,7 @@ def test_there_is_something_to_check():
     assert {"envs/base.py", "taic_jax/rl/ppo.py", "taic_jax/run.py"} <= {label(path) for path in PACKAGE}
 
 
-@pytest.mark.parametrize(
-    "path", [path for path in PACKAGE if path != ROOT / "taic_jax/__init__.py"], ids=label
-)
+@pytest.mark.parametrize("path", [path for path in PACKAGE if path != ROOT / "taic_jax/__init__.py"], ids=label)
 def test_imports_point_to_earlier_layers(path):
     own = module_name(path)
     assert own in RANK, f"{label(path)} is in no layer of {__file__}"

@@ -162,10 +162,12 @@ def test_errors_of_the_program_keep_their_traceback(monkeypatch):
         main([])
 
 
-def test_interrupt_exits_130_with_one_line(monkeypatch, capsys):
-    monkeypatch.setattr(run, "execute", lambda command: (_ for _ in ()).throw(KeyboardInterrupt))
-    assert main([]) == 130
-    assert capsys.readouterr().err.count("\n") == 1
+def test_interrupt_exits_130_and_tells_how_to_continue(pipeline, monkeypatch, capsys):
+    module = sys.modules["taic_jax.pipeline"]
+    monkeypatch.setattr(module, "run_pipeline", lambda *args, **kwargs: (_ for _ in ()).throw(KeyboardInterrupt))
+    assert main(["--run-dir", "mine"]) == 130
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1 and "--resume --run-dir mine" in err
 
 
 def test_help_shows_every_field_with_its_help(capsys):

@@ -26,9 +26,7 @@ def write(tmp_path: Path, text: str) -> Path:
 def replace(config, name: str, value):
     """Replace a field given by its dotted name."""
     first, _, rest = name.partition(".")
-    return dataclasses.replace(
-        config, **{first: replace(getattr(config, first), rest, value) if rest else value}
-    )
+    return dataclasses.replace(config, **{first: replace(getattr(config, first), rest, value) if rest else value})
 
 
 def test_defaults_are_valid():
@@ -84,9 +82,7 @@ def test_floats_may_be_written_as_yaml_misreads_them(tmp_path):
 
 
 def test_yaml_anchors_and_merges_are_read(tmp_path):
-    loaded = load_config(
-        write(tmp_path, "collect: {ppo: &a {epochs: 3}}\ntrain: {ppo: {<<: *a, gamma: 0.5}}")
-    )
+    loaded = load_config(write(tmp_path, "collect: {ppo: &a {epochs: 3}}\ntrain: {ppo: {<<: *a, gamma: 0.5}}"))
     assert (loaded.train.ppo.epochs, loaded.train.ppo.gamma) == (3, 0.5)
 
 
@@ -185,9 +181,7 @@ def test_every_field_has_a_type_that_can_be_checked():
     for cls in CONFIG_CLASSES:
         for name, kind in get_type_hints(cls).items():
             simple = kind in (int, float, bool, str) or kind == tuple[int, ...] or kind in CONFIG_CLASSES
-            assert simple or all(isinstance(choice, str) for choice in get_args(kind)), (
-                f"{cls.__name__}.{name}"
-            )
+            assert simple or all(isinstance(choice, str) for choice in get_args(kind)), f"{cls.__name__}.{name}"
 
 
 def test_config_classes_are_all_there():

@@ -1,10 +1,12 @@
 """What is shipped: wheel and sdist hold all three packages, and the constraints no addresses."""
 
+import itertools
 import re
 import shutil
 import subprocess
 import sys
 import tarfile
+import tomllib
 import zipfile
 from importlib import resources
 from pathlib import Path
@@ -27,6 +29,14 @@ def test_constraints_pin_a_jax_for_every_python():
     lines = (ROOT / "constraints.txt").read_text().splitlines()
     markers = [line.partition(" ; ")[2] for line in lines if line.startswith("jax==")]
     assert markers == ["python_full_version < '3.12'", "python_full_version >= '3.12'"]
+
+
+def test_constraints_pin_everything_that_is_asked_for():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    asked = itertools.chain(project["dependencies"], *project["optional-dependencies"].values())
+    names = {re.split(r"[\[>=]", requirement)[0].lower() for requirement in asked}
+    pinned = {line.partition("==")[0] for line in (ROOT / "constraints.txt").read_text().splitlines()}
+    assert names <= pinned
 
 
 @pytest.mark.parametrize("name", ["envs", "experiments"])
@@ -98,8 +108,6 @@ import taic_jax, taic_jax.run, taic_jax.config_io
 assert taic_jax.__file__.startswith(sys.argv[1]), taic_jax.__file__
 print(taic_jax.config_io.preset_names(), taic_jax.run.parse(["ant"]).config.env.name)
 """
-    done = python(
-        "-I", "-c", code.replace('"site"', repr(str(tmp_path / "site"))), str(tmp_path), cwd=tmp_path
-    )
+    done = python("-I", "-c", code.replace('"site"', repr(str(tmp_path / "site"))), str(tmp_path), cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "half_cheetah" in done.stdout and done.stdout.endswith(" ant\n")

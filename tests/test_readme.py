@@ -1,5 +1,6 @@
 """The README is tested: its Python blocks run, and so do its commands, as dry runs."""
 
+import os
 import re
 import shlex
 import subprocess
@@ -24,7 +25,8 @@ def commands() -> list[str]:
 
 
 def run(args: list[str], cwd: Path) -> None:
-    done = subprocess.run([sys.executable, *args], cwd=cwd, capture_output=True, text=True)
+    env = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, *args], cwd=cwd, env=env, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout[-1000:] + done.stderr[-3000:]
 
 
@@ -41,7 +43,7 @@ def test_python_blocks_run(code, tmp_path):
 @pytest.mark.parametrize("command", commands())
 def test_commands_are_valid(command, tmp_path):
     args = shlex.split(command, comments=True)[1:]
-    if args[1] == "taic_jax.run" and not {"--dry-run", "--help", "--resume"} & set(args):
+    if args[1] == "taic_jax.run" and not {"--dry-run", "--help"} & set(args):
         args.append("--dry-run")
     run(args, tmp_path)
     assert not any(tmp_path.iterdir())

@@ -1,30 +1,15 @@
 """Physics as a pure function of a small state, on interchangeable backends."""
 
-from typing import Protocol
-
 import jax
-from jax import Array
-from jaxtyping import Float
 from mujoco import MjModel
 
-from taic_jax.envs.base import PhysicsState
 from taic_jax.envs.errors import UnknownNameError
-from taic_jax.envs.physics.mjx import MjxPhysics
+from taic_jax.envs.physics.base import Physics
 from taic_jax.envs.physics.mujoco import MujocoPhysics
 
+__all__ = ["BACKENDS", "MujocoPhysics", "Physics", "make_physics"]
+
 BACKENDS = ("auto", "mujoco", "mjx")
-
-
-class Physics(Protocol):
-    """What a task asks of a backend."""
-
-    def init(self, qpos: Float[Array, " nq"], qvel: Float[Array, " nv"]) -> PhysicsState:
-        """Make the state at rest from which an episode starts; costs no forward pass."""
-        ...
-
-    def step(self, state: PhysicsState, ctrl: Float[Array, " nu"]) -> PhysicsState:
-        """Advance by one tick, i.e. all its substeps, under constant controls."""
-        ...
 
 
 def make_physics(
@@ -41,7 +26,7 @@ def make_physics(
     Args:
       model: compiled model.
       substeps: engine steps a tick.
-      backend: `mujoco` (C engine, host threads), `mjx` (JAX), or `auto`: `mujoco` where JAX runs on CPU, else `mjx`.
+      backend: `mujoco` (C engine, host's cores), `mjx` (JAX), or `auto`: `mujoco` where JAX runs on CPU.
       num_threads: threads of the `mujoco` backend; 0 takes one per physical core.
       iterations: solver iterations on `mjx`, None for the model's own.
       ls_iterations: line-search iterations on `mjx`, None for the model's own.
@@ -55,4 +40,6 @@ def make_physics(
         backend = "mujoco" if jax.default_backend() == "cpu" else "mjx"
     if backend == "mujoco":
         return MujocoPhysics(model, substeps, num_threads)
+    from taic_jax.envs.physics.mjx import MjxPhysics  # MJX takes a second to import
+
     return MjxPhysics(model, substeps, iterations, ls_iterations)

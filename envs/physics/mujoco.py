@@ -1,6 +1,5 @@
 """MuJoCo's C engine on all cores, called from inside a jitted program."""
 
-import functools
 import os
 import threading
 from pathlib import Path
@@ -14,30 +13,31 @@ from jax import Array
 from jaxtyping import Float
 
 from taic_jax.envs.base import PhysicsState
+from taic_jax.envs.physics.base import Physics
 
-# The state that MuJoCo integrates, in the order of its state rows (time, of no consequence here, precedes them).
-_PACKED = (
-    mujoco.mjtState.mjSTATE_QPOS,
-    mujoco.mjtState.mjSTATE_QVEL,
-    mujoco.mjtState.mjSTATE_WARMSTART,
-    mujoco.mjtState.mjSTATE_CTRL,
+# What a call sends, in the order of MuJoCo's state rows, where only the time precedes it.
+_SENT = (
+    mujoco.mjtState.mjSTATE_QPOS.value
+    | mujoco.mjtState.mjSTATE_QVEL.value
+    | mujoco.mjtState.mjSTATE_WARMSTART.value
+    | mujoco.mjtState.mjSTATE_CTRL.value
 )
 # After these warnings MuJoCo has put the simulation back to its initial pose.
 _DIVERGED = [
-    int(mujoco.mjtWarning.mjWARN_BADQPOS),
-    int(mujoco.mjtWarning.mjWARN_BADQVEL),
-    int(mujoco.mjtWarning.mjWARN_BADQACC),
+    mujoco.mjtWarning.mjWARN_BADQPOS.value,
+    mujoco.mjtWarning.mjWARN_BADQVEL.value,
+    mujoco.mjtWarning.mjWARN_BADQACC.value,
 ]
 
 
-class MujocoPhysics:
-    """A batched host callback over `mujoco.batch.Batch`.
+class MujocoPhysics(Physics):
+    """A host callback over `mujoco.batch.Batch`; all leading axes (seeds, environments) are one engine call.
 
-    It is pure: what stays in the engine between calls is scratch. Each call overwrites every state field that
-    `mj_step` reads (qpos, qvel, qacc_warmstart, ctrl; the models have no actuator states, mocap bodies or
-    plugins, forces are never applied, and time enters neither forces nor constraints), so the result depends on
-    the arguments alone, at any number of threads. A simulation that diverges comes back as NaN. All leading axes (seeds, environments) become one call of the
-    engine. Calls are serialised: a `Batch` serves one caller at a time.
+    It is pure: what the engine keeps between calls is scratch. Each call overwrites every state field that
+    `mj_step` reads (qpos, qvel, qacc_warmstart, ctrl). The others never change: models with activations,
+    mocap bodies, plugins or equalities are refused, no forces are applied, and the time enters no force. So
+    the result depends on the arguments alone, at any number of threads. A simulation that diverges comes back
+    as NaN. Calls are serialised, since a `Batch` serves one caller at a time.
 
     Args:
       model: compiled model.
@@ -49,52 +49,47 @@ class MujocoPhysics:
     """
 
     def __init__(self, model: mujoco.MjModel, substeps: int, num_threads: int = 0):
-        if model.na or model.nhistory or model.nmocap or model.npluginstate or model.neq:
-            raise ValueError("MujocoPhysics carries qpos and qvel only: no activations, mocap, plugins or equalities")
-        self.model = model
-        self.substeps = substeps
+        if model.na or model.nhistory or model.nmocap or model.nplugin or model.neq:
+            raise ValueError("the model must have no activations, mocap bodies, plugins or equalities")
+        super().__init__(model, substeps)
         self.num_threads = num_threads or num_physical_cores()
         self._lock = threading.Lock()
         self._batches: dict[int, tuple[mujoco.batch.Batch, np.ndarray]] = {}
 
-    def init(self, qpos: Float[Array, " nq"], qvel: Float[Array, " nv"]) -> PhysicsState:
-        """Make the state from which an episode starts."""
-        return PhysicsState(qpos=qpos, qvel=qvel, qacc_warmstart=jnp.zeros_like(qvel))
-
     def step(self, state: PhysicsState, ctrl: Float[Array, " nu"]) -> PhysicsState:
         """Advance by one tick under constant controls."""
         nq, nv = self.model.nq, self.model.nv
-        packed = jnp.concatenate([state.qpos, state.qvel, state.qacc_warmstart, ctrl])
-        out = jax.ShapeDtypeStruct((nq + 2 * nv,), jnp.float32)
-        after = jax.pure_callback(self._step, out, packed, vmap_method="broadcast_all")
+        sent = jnp.concatenate([state.qpos, state.qvel, state.qacc_warmstart, ctrl])
+        shape = jax.ShapeDtypeStruct((nq + 2 * nv,), jnp.float32)
+        after = jax.pure_callback(self._step, shape, sent, vmap_method="broadcast_all")
         return PhysicsState(qpos=after[:nq], qvel=after[nq : nq + nv], qacc_warmstart=after[nq + nv :])
 
-    def _step(self, packed: Float[Array, "*batch n"]) -> Float[np.ndarray, "*batch m"]:
+    def _step(self, sent: Float[Array, "*batch n"]) -> Float[np.ndarray, "*batch m"]:
         """Step all simulations on the host. NumPy only: to call JAX in a callback can deadlock."""
-        packed = np.asarray(packed)
-        simulations = packed.reshape(-1, packed.shape[-1])
+        sent = np.asarray(sent)
+        simulations = sent.reshape(-1, sent.shape[-1])
         with self._lock:
             batch, rows = self._batch(len(simulations))
             rows[...] = simulations
             batch.step(nstep=self.substeps)
             after = rows[:, : self.model.nq + 2 * self.model.nv].astype(np.float32)
-            if batch.warning.any():
+            if batch.warning.any():  # [simulations, kinds, (last info, count)]
                 after[batch.warning[:, _DIVERGED, 1].any(axis=1)] = np.nan
-                batch.warning[:] = 0
-        return after.reshape(*packed.shape[:-1], -1)
+                batch.warning[...] = 0
+        return after.reshape(*sent.shape[:-1], -1)
 
     def _batch(self, num_simulations: int) -> tuple[mujoco.batch.Batch, np.ndarray]:
-        """Return the engine for that many simulations and a live view of its packed state rows."""
+        """Return the engine for so many simulations, and the part of its state rows that calls overwrite."""
         if num_simulations not in self._batches:
             batch = mujoco.batch.Batch(self.model, num_simulations, min(self.num_threads, num_simulations))
-            start = mujoco.mj_stateSize(self.model, mujoco.mjtState.mjSTATE_TIME)
-            size = mujoco.mj_stateSize(self.model, functools.reduce(lambda a, b: a | b, _PACKED))
-            self._batches[num_simulations] = batch, batch.state[:, start : start + size]
+            start = mujoco.mj_stateSize(self.model, mujoco.mjtState.mjSTATE_TIME.value)
+            stop = start + mujoco.mj_stateSize(self.model, _SENT)
+            self._batches[num_simulations] = batch, batch.state[:, start:stop]
         return self._batches[num_simulations]
 
 
 def num_physical_cores() -> int:
-    """Count the physical cores this process may use; hyperthreads of one core count once."""
+    """Count the physical cores this process may use; the hyperthreads of a core count once."""
     if not hasattr(os, "sched_getaffinity"):
         return os.cpu_count() or 1
     cores = set()

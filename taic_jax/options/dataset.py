@@ -1,5 +1,7 @@
 """Windows of experience: action sequences with their start and end states."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -12,10 +14,10 @@ from taic_jax.options.model import Scale
 class Experience(struct.PyTreeNode):
     """T consecutive ticks of B environments; `obs` is the proprioceptive slice."""
 
-    obs: Array
-    action: Array
-    reward: Array
-    done: Array
+    obs: Any
+    action: Any
+    reward: Any
+    done: Any
 
 
 class Window(struct.PyTreeNode):
@@ -41,9 +43,7 @@ class Dataset(struct.PyTreeNode):
     change_scale: Scale
 
 
-def window_score(
-    reward: Float[Array, "T B"], done: Array, length: int
-) -> tuple[Float[Array, "T B"], Array]:
+def window_score(reward: Float[Array, "T B"], done: Array, length: int) -> tuple[Float[Array, "T B"], Array]:
     """Return the reward collected over the `length` ticks from each tick, and whether no episode ends in them.
 
     The tick at which an episode ends is left out too: the state after it is the next episode's.
@@ -72,7 +72,7 @@ def make_dataset(experience: Experience, config: OptionsConfig) -> Dataset:
     else:
         starts = jnp.argsort(~valid, stable=True)
     rows = jax.tree.map(lambda x: x.reshape((-1, *x.shape[2:])), experience)
-    probe = starts[(jnp.arange(100_000) * (count.astype(jnp.float32) / 1e5)).astype(jnp.int32)]
+    probe = starts[(jnp.arange(100_000.0) * (count.astype(jnp.float32) / 1e5)).astype(jnp.int32)]
     state = rows.obs[probe]
     change = rows.obs[probe + config.length * num_envs] - state
     return Dataset(rows, starts, count, _scale(state), _scale(change))
@@ -90,6 +90,4 @@ def gather(dataset: Dataset, which: Int[Array, " N"], length: int, num_envs: int
     rows = start[:, None] + num_envs * jnp.arange(length)[None]
     experience = dataset.experience
     mask = jnp.ones((which.shape[0], length), bool)
-    return Window(
-        experience.obs[start], experience.action[rows], experience.obs[start + length * num_envs], mask
-    )
+    return Window(experience.obs[start], experience.action[rows], experience.obs[start + length * num_envs], mask)

@@ -7,6 +7,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float
 
 from taic_jax.config import OptionsConfig
+from taic_jax.networks import apply
 from taic_jax.options.model import Networks, OptionModel, make_networks
 
 
@@ -72,13 +73,13 @@ class OptionExecutor(struct.PyTreeNode):
 
     def start(self, option: Float[Array, " D"], obs: Float[Array, " S"]) -> Decoding:
         """Set D's carry from the code."""
-        carry = self.networks.decoder.apply(self.model.params["decoder"], option, method="start")
+        carry = apply(self.networks.decoder, self.model.params["decoder"], option, method="start")
         return Decoding(option, carry, jnp.zeros((), jnp.int32))
 
     def act(self, carry: Decoding, obs: Float[Array, " S"]) -> tuple[Decoding, Float[Array, " A"]]:
         """Emit D's next action, clipped to its bounds."""
         params = self.model.params["decoder"]
-        memory, (action, _) = self.networks.decoder.apply(params, carry.carry, carry.option, method="step")
+        memory, (action, _) = apply(self.networks.decoder, params, carry.carry, carry.option, method="step")
         return Decoding(carry.option, memory, carry.tick + 1), jnp.clip(action, -1.0, 1.0)
 
     def ended(self, carry: Decoding, obs: Float[Array, " S"]) -> Bool[Array, ""]:

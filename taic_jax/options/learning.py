@@ -1,6 +1,7 @@
 """Learning options from windows: E, D, P and F jointly (§3.2, §3.3)."""
 
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +10,7 @@ from flax import struct
 from jaxtyping import Array, Float, Key
 
 from taic_jax.config import OptionsConfig
+from taic_jax.networks import apply
 from taic_jax.options.dataset import Dataset, Experience, Window, gather, make_dataset
 from taic_jax.options.losses import (
     adversarial_loss,
@@ -18,7 +20,7 @@ from taic_jax.options.losses import (
     reconstruction_loss,
 )
 from taic_jax.options.model import Networks, OptionModel, init_params, make_networks
-from taic_jax.types import as_arrays
+from taic_jax.types import Scalar, as_arrays
 
 
 class LearnState(struct.PyTreeNode):
@@ -33,12 +35,12 @@ class LearnState(struct.PyTreeNode):
 def make_optimizer(config: OptionsConfig) -> optax.GradientTransformation:
     """Return Adam with one learning rate for E, D and P and another for F."""
 
-    def adam(learning_rate: Float[Array, ""]) -> optax.GradientTransformation:
+    def adam(learning_rate: Scalar) -> optax.GradientTransformation:
         clip = optax.clip_by_global_norm(config.max_grad_norm)
         return optax.flatten(optax.chain(clip, optax.scale_by_adam(), optax.scale(-learning_rate)))
 
-    labels = {"encoder": "model", "decoder": "model", "predictor": "model", "estimator": "estimator"}
-    transforms = {"model": adam(config.learning_rate), "estimator": adam(config.learning_rate_estimator)}
+    labels: Any = {"encoder": "model", "decoder": "model", "predictor": "model", "estimator": "estimator"}
+    transforms: Any = {"model": adam(config.learning_rate), "estimator": adam(config.learning_rate_estimator)}
     return optax.multi_transform(transforms, labels)
 
 
@@ -57,15 +59,15 @@ def window_losses(
     The sum E descends is L_recons + lambda_kl L_KL + lambda_pred L_pred - lambda_adv L_adv, and F descends
     L_adv: the reversal in front of F changes the sign on its way into E and nowhere else.
     """
-    means, log_stds = networks.encoder.apply(params["encoder"], window.actions)
+    means, log_stds = apply(networks.encoder, params["encoder"], window.actions)
     last = jnp.sum(window.mask, dtype=jnp.int32) - 1
     mean, log_std = means[last], log_stds[last]
     option = mean + jnp.exp(log_std) * noise
-    decoded, _ = networks.decoder.apply(params["decoder"], option, window.actions.shape[0])
+    decoded, _ = apply(networks.decoder, params["decoder"], option, window.actions.shape[0])
     start, end = model.state_scale(window.start), model.state_scale(window.end)
     change = model.change_scale(window.end - window.start)
-    predicted = networks.predictor.apply(params["predictor"], start, option)
-    estimated = networks.estimator.apply(params["estimator"], gradient_reversal(option, config.lambda_adv))
+    predicted = apply(networks.predictor, params["predictor"], start, option)
+    estimated = apply(networks.estimator, params["estimator"], gradient_reversal(option, config.lambda_adv))
     return {
         "reconstruction_loss": reconstruction_loss(decoded, window.actions, window.mask),
         "kl_loss": kl_loss(mean, log_std),
@@ -98,11 +100,10 @@ def step(
     windows = gather(dataset, which, config.length, num_envs)
     noise = jax.random.normal(key_option, (config.batch_size, config.size))
     model = as_model(state, dataset)
-    gradient, losses = jax.grad(total_loss, has_aux=True)(
-        state.params, networks, model, config, windows, noise
-    )
-    updates, optimizer = make_optimizer(config).update(gradient, state.optimizer)
-    params = optax.apply_updates(state.params, updates)
+    gradient, losses = jax.grad(total_loss, has_aux=True)(state.params, networks, model, config, windows, noise)
+    with jax.numpy_dtype_promotion("standard"):  # Optax raises a float to an integer power
+        updates, optimizer = make_optimizer(config).update(gradient, state.optimizer)
+    params: Any = optax.apply_updates(state.params, updates)
     return LearnState(params, optimizer, key, state.step + 1), losses
 
 
@@ -120,9 +121,7 @@ def as_model(state: LearnState, dataset: Dataset) -> OptionModel:
     return OptionModel(state.params, dataset.state_scale, dataset.change_scale)
 
 
-def learn(
-    config: OptionsConfig, experience: Experience, key: Key[Array, ""]
-) -> tuple[OptionModel, dict[str, Array]]:
+def learn(config: OptionsConfig, experience: Experience, key: Key[Array, ""]) -> tuple[OptionModel, dict[str, Array]]:
     """Learn an option model from experience [T, B, ...]; pure, so experiences and keys may be vmapped.
 
     Returns the model and the losses of every step, leading axis the step.

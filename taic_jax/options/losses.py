@@ -1,11 +1,13 @@
 """The losses of option learning, each of one window: the caller vmaps and averages."""
 
-from functools import partial
+from typing import Any
 
 import distrax
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
+
+from taic_jax.types import Scalar
 
 
 def reconstruction_loss(
@@ -20,7 +22,8 @@ def kl_loss(mean: Float[Array, " D"], log_std: Float[Array, " D"]) -> Float[Arra
     """L_KL (eq. 2): KL(q(o|a) || N(0, I)) in nats."""
     posterior = distrax.MultivariateNormalDiag(mean, jnp.exp(log_std))
     prior = distrax.MultivariateNormalDiag(jnp.zeros_like(mean), jnp.ones_like(mean))
-    return posterior.kl_divergence(prior)
+    kl: Any = posterior.kl_divergence(prior)
+    return kl
 
 
 def prediction_loss(predicted: Float[Array, " P"], change: Float[Array, " P"]) -> Float[Array, ""]:
@@ -35,8 +38,8 @@ def adversarial_loss(
     return jnp.mean(jnp.square(estimated - jnp.stack([start, end])))
 
 
-@partial(jax.custom_vjp, nondiff_argnums=())
-def gradient_reversal(x: Array, scale: Array) -> Array:
+@jax.custom_vjp
+def gradient_reversal(x: Array, scale: Scalar) -> Array:
     """Return x; its gradient is multiplied by -scale on the way back (figure 2)."""
     return x
 

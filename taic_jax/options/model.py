@@ -66,9 +66,7 @@ class Decoder(nn.Module):
         output = self.head(output)
         return carry, (output[:-1], output[-1])
 
-    def __call__(
-        self, option: Float[Array, " D"], length: int
-    ) -> tuple[Float[Array, "L A"], Float[Array, " L"]]:
+    def __call__(self, option: Float[Array, " D"], length: int) -> tuple[Float[Array, "L A"], Float[Array, " L"]]:
         """Return the `length` actions and end logits that as many steps give."""
         inputs = jnp.broadcast_to(option, (length, *option.shape))
         outputs = self.head(self.rnn(inputs, initial_carry=self.start(option)))

@@ -4,6 +4,7 @@ Flat PPO is the same code with the identity executor, whose options are actions 
 """
 
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +20,7 @@ from taic_jax.networks import Policy, PolicyParams
 from taic_jax.options.execution import Executor
 from taic_jax.returns import semi_markov_advantages
 from taic_jax.rl.rollout import DecideFn, Rollout, Running, rollout, start
-from taic_jax.types import as_arrays
+from taic_jax.types import Scalar, as_arrays
 
 LOSSES = ("policy_loss", "value_loss", "entropy", "approx_kl", "clip_fraction")
 
@@ -44,16 +45,19 @@ class Agent(struct.PyTreeNode):
     obs_statistics: normalize.Statistics
     policy: Policy = struct.field(pytree_node=False)
 
-    def decide(self, deterministic: bool = False) -> DecideFn:
-        """Return the policy as a function of raw observations and standard normal noise."""
-        return partial(_decide, self, deterministic)
+    def decide(self, exploration: Scalar = 1.0) -> DecideFn:
+        """Return the policy as a function of raw observations and standard normal noise.
+
+        The noise is scaled by `exploration`: 1 draws options from pi(o|s), 0 takes their mean.
+        """
+        return partial(_decide, self, exploration)
 
 
 def _decide(
-    agent: Agent, deterministic: bool, obs: Float[Array, "B S"], noise: Float[Array, "B D"]
+    agent: Agent, exploration: Scalar, obs: Float[Array, "B S"], noise: Float[Array, "B D"]
 ) -> tuple[Float[Array, "B D"], Float[Array, " B"]]:
-    distribution = agent.policy.distribution(agent.params, normalize.normalize(agent.obs_statistics, obs))
-    option = distribution.loc if deterministic else distribution.loc + distribution.scale_diag * noise
+    distribution: Any = agent.policy.distribution(agent.params, normalize.normalize(agent.obs_statistics, obs))
+    option = distribution.loc + exploration * distribution.scale_diag * noise
     return option, distribution.log_prob(option)
 
 
@@ -82,7 +86,7 @@ def init(config: PPOConfig, env: Env, executor: Executor, key: Key[Array, ""]) -
     """Return the state before the first iteration."""
     key, key_params, key_envs = jax.random.split(key, 3)
     policy = make_policy(executor, config)
-    params = policy.init(key_params, env.observation_size, config.log_std_init)
+    params: Any = policy.init(key_params, env.observation_size, config.log_std_init)
     return TrainState(
         params=params,
         optimizer=make_optimizer(config).init(params),
@@ -116,7 +120,7 @@ def ppo_loss(
     entropy = jnp.sum(weight * distribution.entropy())
     loss = policy_loss + config.value_weight * value_loss - config.entropy_weight * entropy
     approx_kl = jnp.sum(weight * (ratio - 1.0 - log_ratio))
-    clip_fraction = jnp.sum(weight * (jnp.abs(ratio - 1.0) > config.clip))
+    clip_fraction = jnp.sum(weight, where=jnp.abs(ratio - 1.0) > config.clip)
     return loss, jnp.stack([policy_loss, value_loss, entropy, approx_kl, clip_fraction])
 
 
@@ -131,7 +135,7 @@ class _Update(struct.PyTreeNode):
 def _minibatch(
     policy: Policy,
     config: PPOConfig,
-    learning_rate: Float[Array, ""],
+    learning_rate: Scalar,
     rows: Decisions,
     count: Int[Array, ""],
     num_minibatches: Int[Array, ""],
@@ -143,9 +147,10 @@ def _minibatch(
     first = index * size + jnp.minimum(index, rest)
     size = size + (index < rest).astype(jnp.int32)
     batch = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, first, config.minibatch_size), rows)
-    weight = (jnp.arange(config.minibatch_size) < size) / size.astype(jnp.float32)
+    weight = jnp.where(jnp.arange(config.minibatch_size) < size, 1.0 / size.astype(jnp.float32), 0.0)
     gradient, terms = jax.grad(ppo_loss, has_aux=True)(carry.params, policy, batch, weight, config)
-    updates, optimizer = make_optimizer(config).update(gradient, carry.optimizer)
+    with jax.numpy_dtype_promotion("standard"):  # Optax raises a float to an integer power
+        updates, optimizer = make_optimizer(config).update(gradient, carry.optimizer)
     params = jax.tree.map(lambda p, u: p - learning_rate * u, carry.params, updates)
     return _Update(params, optimizer, carry.terms + terms)
 
@@ -153,7 +158,7 @@ def _minibatch(
 def _epoch(
     policy: Policy,
     config: PPOConfig,
-    learning_rate: Float[Array, ""],
+    learning_rate: Scalar,
     packed: Float[Array, "R F"],
     decision: Array,
     carry: _Update,
@@ -174,7 +179,7 @@ def _epoch(
 def _update(
     policy: Policy,
     config: PPOConfig,
-    learning_rate: Float[Array, ""],
+    learning_rate: Scalar,
     state: TrainState,
     decisions: Decisions,
     decision: Array,
@@ -210,9 +215,7 @@ def iterate(
     policy = make_policy(executor, config)
     key, key_rollout, key_update = jax.random.split(state.key, 3)
     decide = as_agent(config, executor, state).decide()
-    running, ticks = rollout(
-        AutoReset(env), executor, decide, state.running, key_rollout, config.rollout_length
-    )
+    running, ticks = rollout(AutoReset(env), executor, decide, state.running, key_rollout, config.rollout_length)
     reward_scale, reward = state.reward_scale, ticks.reward
     if config.normalize_reward:
         done = ticks.terminated | ticks.truncated
@@ -239,7 +242,7 @@ def iterate(
     if config.normalize_advantage:
         decisions = decisions.replace(advantage=_standardize(decisions.advantage, decision))
 
-    progress = state.iteration / num_iterations if config.learning_rate_decay else 0.0
+    progress = state.iteration.astype(jnp.float32) / num_iterations if config.learning_rate_decay else 0.0
     learning_rate = config.learning_rate * (1.0 - progress)
     result = _update(policy, config, learning_rate, state, decisions, decision, key_update)
     state = state.replace(

@@ -53,7 +53,7 @@ def start(env: Env, executor: Executor, num_envs: int, key: Key[Array, ""]) -> R
     state = jax.vmap(env.reset)(jax.random.split(key, num_envs))
     options = jax.vmap(executor.start)(jnp.zeros((num_envs, executor.option_size)), state.obs)
     zeros = jnp.zeros(num_envs)
-    return Running(state, options, jnp.ones(num_envs, bool), zeros, jnp.full(num_envs, jnp.nan))
+    return Running(state, options, jnp.ones(num_envs, bool), zeros, jnp.full(num_envs, jnp.nan, jnp.float32))
 
 
 def _tick(
@@ -68,7 +68,7 @@ def _tick(
     option, log_prob = decide(obs, noise)
     fresh = jax.vmap(executor.start)(option, obs)
     carry, action = jax.vmap(executor.act)(select(decision, fresh, running.option), obs)
-    state = jax.vmap(env.step)(running.env, action)
+    state: Any = jax.vmap(env.step)(running.env, action)
     done = state.terminated | state.truncated
     ended = jax.vmap(executor.ended)(carry, state.final_obs) | done
     total = running.episode_return + state.reward

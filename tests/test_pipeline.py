@@ -1,0 +1,196 @@
+"""The main job, tiny but whole: what it leaves behind, what it refuses, and what an interruption changes (nothing)."""
+
+import json
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from jax.experimental.compilation_cache import compilation_cache
+from orbax.checkpoint import v1 as ocp
+from PIL import Image
+
+from taic_jax import pipeline, stage
+from taic_jax.checkpoint import Checkpoints
+from taic_jax.config import CollectConfig, Config, EvaluateConfig, OptionsConfig, PPOConfig, TrainConfig
+from taic_jax.config_io import load_config
+from taic_jax.experience import ExperienceStore, read_experience
+from taic_jax.logging import RunLogger, read_metrics
+from taic_jax.pipeline import RunFolderError, run_pipeline
+
+PPO = PPOConfig(num_envs=2, rollout_length=8, epochs=1, minibatch_size=16, hidden_sizes=(4,))
+CONFIG = Config(
+    collect=CollectConfig(ticks=3 * 16, capacity=2 * 16, ppo=PPO),
+    options=OptionsConfig(length=2, size=2, hidden_size=4, mlp_sizes=(4,), steps=4, batch_size=8),
+    train=TrainConfig(ticks=3 * 16, ppo=PPO),
+    evaluate=EvaluateConfig(episodes=2, video_ticks=3),
+    seeds=2,
+)
+STAGES = {"collect": 3, "learn": 2, "train": 3}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def tiny_steps(tmp_path_factory):
+    """Compile each program once for all runs here, save a checkpoint at every step, and log every second one."""
+    settings = {
+        "jax_compilation_cache_dir": str(tmp_path_factory.mktemp("compiled")),
+        "jax_persistent_cache_min_compile_time_secs": 0.0,
+        "jax_persistent_cache_min_entry_size_bytes": -1,
+    }
+    before = {name: getattr(jax.config, name) for name in settings}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(stage, "CHECKPOINT_SECONDS", 0.0)
+        patch.setattr(pipeline, "STEPS_PER_LOG", 2)
+        for name, value in settings.items():
+            jax.config.update(name, value)
+        compilation_cache.reset_cache()
+        yield
+    for name, value in before.items():
+        jax.config.update(name, value)
+    compilation_cache.reset_cache()
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory) -> Path:
+    """Return the folder of a run that nothing interrupted."""
+    folder = tmp_path_factory.mktemp("runs") / "finished"
+    run_pipeline(CONFIG, folder)
+    return folder
+
+
+def files_of(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def rows_of(folder: Path) -> list[dict]:
+    """Return the rows of the metrics in one order, without the time they were written."""
+    rows = [{**row, "time": None} for row in read_metrics(folder / "metrics.jsonl")]
+    return sorted(rows, key=lambda row: (row["stage"], row.get("ticks", row.get("steps")), sorted(row)))
+
+
+def last_states(folder: Path) -> dict[str, dict[str, np.ndarray]]:
+    return {name: ocp.load(folder / "checkpoints" / name / str(steps)) for name, steps in STAGES.items()} | {
+        "options": ocp.load(folder / "options")
+    }
+
+
+def methods_of(folder: Path) -> dict:
+    return json.loads((folder / "summary.json").read_text())["methods"]
+
+
+def test_leaves_a_whole_run_behind(finished):
+    assert load_config(finished / "config.yaml") == CONFIG
+    summary = json.loads((finished / "summary.json").read_text())
+    assert set(summary) == {"ticks", "ticks_per_second", "seconds", "methods", "versions", "commit"}
+    assert summary["ticks"] == 2 * (48 + 48) and summary["ticks_per_second"] > 0
+    assert set(summary["seconds"]) == {"compile", "run"} and summary["versions"]["jax"] == jax.__version__
+    assert set(summary["methods"]) == {"flat", "taic"}
+    for method in summary["methods"].values():
+        result = method["return"]
+        assert {"per_seed", "first_per_seed", "iqm", "ci95"} <= set(result)
+        assert len(result["per_seed"]) == len(result["first_per_seed"]) == 2
+        assert len(result["ci95"]) == 2 and -200 <= result["iqm"] <= 100
+    with Image.open(finished / "video.webp") as video:
+        assert video.format == "WEBP"
+
+
+def test_logs_every_step_of_every_stage(finished):
+    of_ticks = [(row["stage"], row["ticks"]) for row in rows_of(finished) if "ticks" in row]
+    collect, train = ([(name, ticks) for ticks in (16, 32, 48)] for name in ("collect", "train"))
+    assert of_ticks == [*collect, ("evaluate", 48), ("evaluate", 48), *train]
+    assert [(row["stage"], row["steps"]) for row in rows_of(finished) if "steps" in row] == [("learn", 2), ("learn", 4)]
+    losses = [row["train/value_loss"] for row in rows_of(finished) if row["stage"] == "train"]
+    assert np.shape(losses) == (3, 2) and np.isfinite(losses).all()
+    assert any((finished / "tensorboard").iterdir())
+
+
+def test_keeps_the_newest_experience_of_each_seed(finished):
+    experience = [read_experience(finished / "experience", seed) for seed in range(2)]
+    assert all(e.obs.shape == (16, 2, 2) and e.action.shape == (16, 2, 2) for e in experience)
+    assert (experience[0].action != experience[1].action).all()
+
+
+def refused(run_dir: Path, config: Config = CONFIG, **options: bool) -> str:
+    """Return why a run is refused, having checked that nothing was touched."""
+    before = files_of(run_dir)
+    with pytest.raises(RunFolderError) as error:
+        run_pipeline(config, run_dir, **options)
+    assert files_of(run_dir) == before and "\n" not in str(error.value)
+    return str(error.value)
+
+
+def test_refuses_folders_that_are_not_its_own(finished, tmp_path):
+    other = Config(**{**vars(CONFIG), "train": TrainConfig(ticks=64, ppo=PPO)})
+    assert "--resume" in refused(finished)
+    assert "ticks: 64" in refused(finished, other, resume=True)
+    assert "no config.yaml" in refused(tmp_path, resume=True)
+    (tmp_path / "thesis.txt").write_text("years of work")
+    assert "already holds files" in refused(tmp_path)
+    assert "not overwritten" in refused(tmp_path, overwrite=True)
+    with pytest.raises(RunFolderError):
+        run_pipeline(CONFIG, tmp_path / "thesis.txt", overwrite=True)
+    assert (tmp_path / "thesis.txt").read_text() == "years of work"
+
+
+class KilledError(Exception):
+    """The process died here."""
+
+
+def die(monkeypatch, owner: type, method: str, count: int) -> None:
+    """Make the `count`-th call of a method from now on the last thing that happens."""
+    original, calls = getattr(owner, method), []
+
+    def dying(self, *args):
+        calls.append(args)
+        if len(calls) == count:
+            raise KilledError
+        return original(self, *args)
+
+    monkeypatch.setattr(owner, method, dying)
+
+
+def test_overwrites_a_run_when_asked(finished, tmp_path, monkeypatch):
+    (tmp_path / "config.yaml").write_bytes((finished / "config.yaml").read_bytes())
+    (tmp_path / "summary.json").write_text("old")
+    die(monkeypatch, RunLogger, "truncate", 1)
+    with pytest.raises(KilledError):
+        run_pipeline(CONFIG, tmp_path, overwrite=True)
+    assert "summary.json" not in files_of(tmp_path) and load_config(tmp_path / "config.yaml") == CONFIG
+
+
+def test_an_interrupted_run_ends_as_if_it_had_not_been(finished, tmp_path, monkeypatch):
+    deaths = [
+        (ExperienceStore, "write", 2),  # in collect, between the row of an iteration and its block
+        (RunLogger, "log", 2 + 1 + 1),  # the rows left of collect, its evaluation, then in learn before a row
+        (Checkpoints, "save", 1 + 2),  # in learn, then in train, with rows that no checkpoint covers
+    ]
+    folder = tmp_path / "run"
+    for i, death in enumerate(deaths):
+        with monkeypatch.context() as patch, pytest.raises(KilledError):
+            die(patch, *death)
+            run_pipeline(CONFIG, folder, resume=i > 0)
+    run_pipeline(CONFIG, folder, resume=True)
+    for name, state in last_states(finished).items():
+        resumed = last_states(folder)[name]
+        assert state.keys() == resumed.keys()
+        for leaf in state:
+            np.testing.assert_array_equal(state[leaf], resumed[leaf], err_msg=f"{name}: {leaf}")
+    assert methods_of(folder) == methods_of(finished)
+    assert json.loads((folder / "summary.json").read_text())["ticks"] == 2 * (48 + 48)
+    assert rows_of(folder) == rows_of(finished)
+    blocks = {name for name in files_of(finished) if name.startswith("experience") or name == "config.yaml"}
+    assert {name: files_of(folder)[name] for name in blocks} == {name: files_of(finished)[name] for name in blocks}
+
+
+def test_a_seed_does_not_depend_on_how_many_run(finished, tmp_path):
+    """Seed 1 of seeds 0 and 1 is the run with seed 1 alone."""
+    run_pipeline(Config(**{**vars(CONFIG), "seed": 1, "seeds": 1}), tmp_path / "run")
+    for name, state in last_states(tmp_path / "run").items():
+        both = last_states(finished)[name]
+        for leaf in state:
+            np.testing.assert_allclose(state[leaf][0], both[leaf][1], rtol=1e-3, atol=1e-5, err_msg=f"{name}: {leaf}")
+    alone, both = methods_of(tmp_path / "run"), methods_of(finished)
+    for method in both:
+        for metric, values in both[method]["metrics"].items():
+            got = alone[method]["metrics"][metric]["per_seed"][0]
+            np.testing.assert_allclose(got, values["per_seed"][1], rtol=1e-3, err_msg=f"{method}: {metric}")

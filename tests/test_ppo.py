@@ -1,0 +1,189 @@
+"""PPO over decisions: its loss by hand, its bookkeeping against plain code, and tasks whose answer is known."""
+
+import dataclasses
+import math
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from probes import Constant, Counting, Observed, OneOf, Repeat, Sign, TwoStep, assert_trees_equal
+
+from taic_jax import normalize
+from taic_jax.config import PPOConfig
+from taic_jax.networks import Policy, PolicyParams
+from taic_jax.options.execution import IdentityExecutor
+from taic_jax.returns import semi_markov_advantages
+from taic_jax.rl import ppo
+from taic_jax.rl.rollout import Rollout
+from taic_jax.types import as_arrays
+
+ENV, EXECUTOR = Counting(7, truncated=True, spread=5), Repeat(3)
+ITERATIONS = 4
+ONE_STEP = PPOConfig(
+    num_envs=4, rollout_length=16, epochs=1, minibatch_size=64, hidden_sizes=(4,), learning_rate=0.01,
+    entropy_weight=0.01, normalize_reward=False,
+)  # fmt: skip
+
+
+def test_loss_by_hand():
+    policy = Policy(1, (2,))
+    # All weights zero: mean option 0, standard deviation 1, value 0.
+    shapes = jax.eval_shape(lambda: policy.init(jax.random.key(0), 1, jnp.zeros(())))
+    params = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape), shapes)
+    ratio = jnp.array([1.5, 1.5, 0.5, 0.5, 1.1])
+    advantage = jnp.array([2.0, -2.0, 2.0, -2.0, 1.0])
+    option = jnp.array([[0.0], [1.0], [2.0], [-1.0], [0.5]])
+    log_prob = -0.5 * option[:, 0] ** 2 - 0.5 * math.log(2 * math.pi)
+    decisions = ppo.Decisions(jnp.zeros((5, 1)), option, log_prob - jnp.log(ratio), advantage, jnp.arange(5.0))
+    config = as_arrays(PPOConfig(clip=0.2, value_weight=0.5, entropy_weight=0.1))
+    loss, terms = jax.jit(ppo.ppo_loss, static_argnums=1)(params, policy, decisions, jnp.full(5, 0.2), config)
+    # min(ratio A, clipped A): 1.2 * 2, 1.5 * -2, 0.5 * 2, 0.8 * -2, 1.1 * 1; sum -0.1, mean -0.02.
+    policy_loss = 0.02
+    value_loss = 0.5 * (0 + 1 + 4 + 9 + 16) / 5
+    entropy = 0.5 * math.log(2 * math.pi * math.e)
+    approx_kl = np.mean([r - 1 - math.log(r) for r in (1.5, 1.5, 0.5, 0.5, 1.1)])
+    np.testing.assert_allclose(terms, [policy_loss, value_loss, entropy, approx_kl, 4 / 5], rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(loss, policy_loss + 0.5 * value_loss - 0.1 * entropy, rtol=1e-5)
+
+
+@pytest.fixture(scope="module")
+def iterate():
+    """One iteration that is one gradient step on all decisions, compiled once."""
+    return jax.jit(partial(ppo.iterate, as_arrays(ONE_STEP), ENV, EXECUTOR, ITERATIONS))
+
+
+@pytest.fixture(scope="module")
+def first_state() -> ppo.TrainState:
+    return jax.jit(partial(ppo.init, as_arrays(ONE_STEP), ENV, EXECUTOR))(jax.random.key(3))
+
+
+@jax.jit
+def plain_update(
+    state: ppo.TrainState, last_obs: jax.Array, ticks: Rollout, rows: tuple[jax.Array, jax.Array]
+) -> tuple[PolicyParams, jax.Array]:
+    """Do what the iteration should have done to the parameters, in plain code, on the decisions at `rows` alone."""
+    config, policy = as_arrays(ONE_STEP), ppo.make_policy(EXECUTOR, ONE_STEP)
+    obs, final_obs, last_obs = (
+        normalize.normalize(state.obs_statistics, x) for x in (ticks.obs, ticks.final_obs, last_obs)
+    )
+    value, final_value, last_value = (policy.value(state.params, x) for x in (obs, final_obs, last_obs))
+    advantage = semi_markov_advantages(
+        reward=ticks.reward, ended=ticks.ended, terminated=ticks.terminated, truncated=ticks.truncated,
+        value=value, final_value=final_value, last_value=last_value, gamma=config.gamma, lambda_=config.lambda_,
+    )  # fmt: skip
+    target, advantage = (advantage + value)[rows], advantage[rows]
+    advantage = (advantage - advantage.mean()) / advantage.std()
+    decisions = ppo.Decisions(obs[rows], ticks.option[rows], ticks.log_prob[rows], advantage, target)
+    weight = jnp.full(len(advantage), 1.0 / len(advantage))
+    gradient, terms = jax.grad(ppo.ppo_loss, has_aux=True)(state.params, policy, decisions, weight, config)
+    adam = optax.chain(optax.clip_by_global_norm(0.5), optax.adam(ONE_STEP.learning_rate, eps=1e-5))
+    with jax.numpy_dtype_promotion("standard"):
+        updates, _ = adam.update(gradient, adam.init(state.params))
+    return optax.apply_updates(state.params, updates), terms
+
+
+def test_an_iteration_is_the_plain_update_on_its_decisions(iterate, first_state):
+    state, metrics, ticks = iterate(first_state)
+    assert 0.3 < np.mean(ticks.decision) < 0.5 and metrics["decisions"] == int(ticks.decision.sum())
+    rows = np.nonzero(np.asarray(ticks.decision))
+    params, terms = plain_update(first_state, state.running.env.obs, ticks, rows)
+    assert_trees_equal(state.params, params, rtol=1e-4, atol=1e-6)
+    assert_trees_equal([metrics[name] for name in ppo.LOSSES], list(terms), rtol=1e-4, atol=1e-6)
+
+
+def test_the_first_pass_sees_the_policy_that_acted(iterate, first_state):
+    """Ratios are 1: nothing is clipped, no divergence, and the loss is minus the mean advantage, standardised."""
+    _, metrics, _ = iterate(first_state)
+    np.testing.assert_allclose([metrics["policy_loss"], metrics["approx_kl"], metrics["clip_fraction"]], 0.0, atol=1e-6)
+
+
+def test_iterations_share_one_program_and_statistics_follow_the_ticks(iterate, first_state):
+    state, seen, count = first_state, [], iterate._cache_size()
+    for _ in range(3):
+        state, _, ticks = iterate(state)
+        seen.append(ticks.obs)
+    assert iterate._cache_size() == max(count, 1) == 1
+    assert state.iteration == 3
+    np.testing.assert_allclose(state.obs_statistics.mean, np.mean(seen, axis=(0, 1, 2)), rtol=1e-5)
+
+
+def test_the_step_size_falls_linearly_to_zero(iterate, first_state):
+    def step_at(iteration: int) -> list[np.ndarray]:
+        state, _, _ = iterate(first_state.replace(iteration=jnp.int32(iteration)))
+        return jax.tree.leaves(jax.tree.map(lambda a, b: np.asarray(a - b), state.params, first_state.params))
+
+    whole, half, none = step_at(0), step_at(ITERATIONS // 2), step_at(ITERATIONS)
+    for a, b, c in zip(whole, half, none, strict=True):
+        np.testing.assert_allclose(b, a / 2, rtol=1e-3, atol=1e-6)
+        assert not c.any()
+
+
+def pairs(a: jax.Array, b: jax.Array) -> list[tuple[float, float]]:
+    return list(zip(a.tolist(), b.tolist(), strict=True))
+
+
+def test_every_decision_is_used_once_an_epoch_and_nothing_else(monkeypatch, first_state):
+    minibatches, true_loss = [], ppo.ppo_loss
+
+    def spy(params, policy, batch, weight, config):
+        jax.debug.callback(lambda *x: minibatches.append(x), batch.option[:, 0], batch.log_prob, weight)
+        return true_loss(params, policy, batch, weight, config)
+
+    monkeypatch.setattr(ppo, "ppo_loss", spy)
+    config = as_arrays(dataclasses.replace(ONE_STEP, epochs=2, minibatch_size=5))
+    _, _, ticks = jax.jit(partial(ppo.iterate, config, ENV, EXECUTOR, ITERATIONS))(first_state)
+    jax.effects_barrier()
+    decisions = pairs(ticks.option[ticks.decision][:, 0], ticks.log_prob[ticks.decision])
+    assert len(minibatches) == 2 * math.ceil(len(decisions) / 5)
+    used = []
+    for minibatch in minibatches:
+        option, log_prob, weight = map(np.asarray, minibatch)
+        rows = weight > 0
+        assert 1 <= rows.sum() <= 5
+        np.testing.assert_allclose(weight[rows], 1.0 / np.sum(rows))
+        used += pairs(option[rows], log_prob[rows])
+    assert sorted(used) == sorted(decisions + decisions)
+    for epoch in (used[: len(decisions)], used[len(decisions) :]):
+        assert sorted(epoch) == sorted(decisions) and epoch != decisions
+
+
+def test_solves_the_probes():
+    env = OneOf(Constant(), Observed(), TwoStep(), Sign())
+    config = PPOConfig(
+        num_envs=64, rollout_length=8, epochs=4, minibatch_size=128, hidden_sizes=(32,), learning_rate=0.02,
+        gamma=0.5, normalize_reward=False,
+    )  # fmt: skip
+    ticks = 50 * config.num_envs * config.rollout_length
+    agent, _ = jax.jit(lambda key: ppo.train(config, env, IdentityExecutor(1), key, ticks))(jax.random.key(0))
+    # Constant at 0, Observed at -1 and 1, TwoStep at 0 and 1, Sign at -1 and 1.
+    which, x = jnp.array([0, 1, 1, 2, 2, 3, 3]), jnp.array([0.0, -1.0, 1.0, 0.0, 1.0, -1.0, 1.0])
+    obs = jax.vmap(env.observe)((x, which))
+    value = agent.policy.value(agent.params, normalize.normalize(agent.obs_statistics, obs))
+    np.testing.assert_allclose(value[:5], [1.0, -1.0, 1.0, config.gamma, 1.0], atol=0.1)
+    np.testing.assert_allclose(value[5:], [1.0, 1.0], atol=0.2)
+    action, _ = agent.decide(exploration=0.0)(obs, jnp.zeros((7, 1)))
+    assert action[5, 0] < -0.5 and action[6, 0] > 0.5
+
+
+def train(config: PPOConfig, key: jax.Array) -> tuple[ppo.Agent, dict[str, jax.Array]]:
+    return ppo.train(config, ENV, EXECUTOR, key, 2 * config.num_envs * config.rollout_length)
+
+
+train_alone, train_together = jax.jit(train), jax.jit(jax.vmap(train))
+
+
+@pytest.mark.parametrize(
+    ("learning_rates", "seeds"), [((0.01, 0.01), (0, 1)), ((0.01, 0.03), (0, 0))], ids=["keys", "config leaf"]
+)
+def test_vmapped_runs_are_the_runs_alone(learning_rates, seeds):
+    configs = [as_arrays(dataclasses.replace(ONE_STEP, epochs=2, learning_rate=rate)) for rate in learning_rates]
+    keys = [jax.random.key(seed) for seed in seeds]
+    together = train_together(jax.tree.map(lambda *leaves: jnp.stack(leaves), *configs), jnp.stack(keys))
+    alone = [train_alone(config, key) for config, key in zip(configs, keys, strict=True)]
+    for k in range(2):
+        assert_trees_equal(jax.tree.map(lambda x, k=k: x[k], together), alone[k], rtol=1e-4, atol=1e-5)
+    assert (alone[0][0].params.log_std != alone[1][0].params.log_std).all()
+    assert train_alone._cache_size() == train_together._cache_size() == 1
