@@ -49,7 +49,7 @@ class BraxEnv(Env):
             raise UnknownNameError("pipeline", pipeline, BRAX_PIPELINES)
         self.name = BRAX_PREFIX + name
         with third_party():
-            self.brax_env = brax_envs.get_environment(name, backend=pipeline)
+            self.brax_env: Any = brax_envs.get_environment(name, backend=pipeline)
             self.action_size = self.brax_env.action_size
             self.dt = float(getattr(self.brax_env, "dt", 1.0))  # `fast`, a test of Brax's own, has no clock
             start = jax.eval_shape(self.brax_env.reset, jax.random.key(0))

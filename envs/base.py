@@ -26,9 +26,10 @@ class State(struct.PyTreeNode):
     terminated: Array  # [] bool, the task ended
     truncated: Array  # [] bool, the time limit cut it
     metrics: dict[str, Array]  # [] float32 each: reward terms, distance to goal, success
-    tick: Array | None = None  # [] int32, ticks since reset (`TimeLimit`)
-    key: Array | None = None  # typed PRNG key of the resets to come (`AutoReset`)
-    final_obs: Array | None = None  # [S], obs before a reset; equals obs where none happened (`AutoReset`)
+    # None without the wrapper named.
+    tick: Array = struct.field(default=None)  # [] int32, ticks since reset (`TimeLimit`)
+    key: Array = struct.field(default=None)  # typed PRNG key of the resets to come (`AutoReset`)
+    final_obs: Array = struct.field(default=None)  # [S] before a reset; equals obs if none happened (`AutoReset`)
 
 
 class Env(abc.ABC):

@@ -79,7 +79,7 @@ class Locomotion(Env):
         self.proprioceptive_size = self.observation_size
         self.episode_length = robot.episode_length
         self.dt = self.model.opt.timestep * robot.substeps
-        self._init_qpos = initial_qpos(self.model).astype(np.float32)
+        self._init_qpos = jnp.asarray(initial_qpos(self.model), jnp.float32)
 
     def reset(self, key: Key[Array, ""]) -> State:
         """Start near the initial pose, with Gym's noise."""
@@ -136,8 +136,10 @@ class Locomotion(Env):
 
 def load_brax_model(name: str) -> mujoco.MjModel:
     """Compile a robot from the MJCF in the brax package, found without importing brax (which is slow)."""
-    (folder,) = importlib.util.find_spec("brax").submodule_search_locations
-    spec = mujoco.MjSpec.from_file(str(Path(folder) / "envs" / "assets" / f"{name}.xml"))
+    brax = importlib.util.find_spec("brax")
+    if brax is None or brax.origin is None:
+        raise ModuleNotFoundError("the robots' MJCF comes with the package brax, which is not installed")
+    spec = mujoco.MjSpec.from_file(str(Path(brax.origin).parent / "envs" / "assets" / f"{name}.xml"))
     # MuJoCo deprecates the attribute `settotalmass`, with a warning; this is the replacement it asks for.
     total_mass, spec.compiler.settotalmass = spec.compiler.settotalmass, -1
     model = spec.compile()

@@ -74,7 +74,8 @@ def render_room(
         spine.set(color=_WALL, linewidth=2)
     for x, y, x_high, y_high in walls:
         axes.add_patch(matplotlib.patches.Rectangle((x, y), x_high - x, y_high - y, color=_WALL))
-    target = axes.add_patch(matplotlib.patches.Circle((0, 0), goal_radius, color=_GOAL, alpha=0.6, lw=0))
+    target = matplotlib.patches.Circle((0, 0), goal_radius, color=_GOAL, alpha=0.6, linewidth=0)
+    axes.add_patch(target)
     (path,) = axes.plot([], [], color=_POINT, linewidth=1.5, alpha=0.7, solid_capstyle="round")
     (start,) = axes.plot([], [], "o", markersize=6, markerfacecolor="white", markeredgecolor=_POINT)
     (point,) = axes.plot([], [], "o", markersize=7, color=_POINT, markeredgecolor="white", clip_on=False)

@@ -92,9 +92,9 @@ class OptionsConfig:
     """Units of the LSTMs of E and D."""
     mlp_sizes: tuple[int, ...] = (64, 64)
     """Widths of the hidden layers of P and F."""
-    steps: int = 3000
+    steps: int = 2000
     """Gradient steps."""
-    batch_size: int = 256
+    batch_size: int = 128
     """Windows per gradient step."""
     learning_rate: float = 3e-3
     """Step size of Adam for E, D and P."""

@@ -58,6 +58,17 @@ def test_vmap_over_controls_alone():
     assert_same(jax.tree.map(lambda leaf: leaf[2], after), jax.jit(physics.step)(state, ctrl[2]))
 
 
+def test_the_way_for_accelerators_gives_the_same(monkeypatch):
+    """There, `pure_callback` copies to the host and back."""
+    physics = MujocoPhysics(model("ant")[0], 5)
+    state, ctrl = states("ant", 2, 3)
+    expected = jax.jit(jax.vmap(jax.vmap(physics.step)))(state, ctrl)
+    monkeypatch.setattr(jax.lax, "platform_dependent", lambda sent, cpu, default: default(sent))
+    program = jax.jit(lambda state, ctrl: jax.vmap(jax.vmap(physics.step))(state, ctrl))
+    assert "pure_callback" in str(jax.make_jaxpr(program)(state, ctrl))
+    assert_same(expected, program(state, ctrl))
+
+
 def test_result_depends_on_the_arguments_alone():
     """Not on what the engine stepped before, nor on the number of threads."""
     physics = MujocoPhysics(model("ant")[0], 5, num_threads=2)
