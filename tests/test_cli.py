@@ -113,7 +113,7 @@ BAD_ARGUMENTS = {
     "budget below one iteration": (
         "half_cheetah --train.ticks 9",
         "train.ticks: expected",
-        "nearest valid value is 16384",
+        "nearest valid value is 8192",
     ),
     "option longer than rollout": (
         "--options.length 9999",
@@ -123,7 +123,7 @@ BAD_ARGUMENTS = {
     "minibatch above rollout": (
         "half_cheetah --train.ppo.minibatch-size 99999",
         "train.ppo.minibatch_size",
-        "16384",
+        "8192",
     ),
     "resume what": ("--resume", "--resume: expected", "--run-dir"),
     "resume and overwrite": ("--resume --overwrite --run-dir x", "--resume and --overwrite", "at most one"),

@@ -172,18 +172,20 @@ def test_auto_reset_computes_no_reset_while_nothing_ends():
     assert "stablehlo.case" in program or "stablehlo.if" in program
 
 
-def test_auto_reset_is_the_same_under_vmap_and_alone():
+def five_ticks(key):
+    """Return the observations of five ticks with episodes of two."""
     env = AutoReset(TimeLimit(Clock(2), 10))
+
+    def tick(state, _):
+        state = env.step(state, jnp.zeros(1))
+        return state, state.obs
+
+    return jax.lax.scan(tick, env.reset(key), length=5)[1]
+
+
+def test_auto_reset_is_the_same_under_vmap_and_alone():
     keys = jax.random.split(jax.random.key(0), 3)
-
-    def episodes(key):
-        def tick(state, _):
-            state = env.step(state, jnp.zeros(1))
-            return state, state.obs
-
-        return jax.lax.scan(tick, env.reset(key), length=5)[1]
-
-    batched, alone = jax.jit(jax.vmap(episodes))(keys), jax.jit(episodes)
+    batched, alone = jax.jit(jax.vmap(five_ticks))(keys), jax.jit(five_ticks)
     np.testing.assert_array_equal(batched, np.stack([alone(key) for key in keys]))
 
 

@@ -119,7 +119,7 @@ def test_divergence_ends_the_episode_in_the_last_finite_state(name, monkeypatch,
 def test_starts_have_gyms_noise(name):
     env, reset, _ = task(name)
     physics = reset(jax.random.split(jax.random.key(0), 4000)).physics
-    qpos = np.asarray(physics.qpos) - env.env._init_qpos
+    qpos = np.asarray(physics.qpos) - np.asarray(env.env._init_qpos)
     assert np.abs(qpos).max() <= 0.1 + 1e-6
     np.testing.assert_allclose(qpos.std(0), 0.1 / np.sqrt(3), rtol=0.04)  # uniform on +-0.1
     np.testing.assert_allclose(qpos.mean(0), 0, atol=0.005)

@@ -10,6 +10,7 @@ import numpy as np
 import optax
 import pytest
 from probes import Constant, Counting, Observed, OneOf, Repeat, Sign, TwoStep, assert_trees_equal
+from scipy import stats
 
 from taic_jax import normalize
 from taic_jax.config import PPOConfig
@@ -47,6 +48,19 @@ def test_loss_by_hand():
     approx_kl = np.mean([r - 1 - math.log(r) for r in (1.5, 1.5, 0.5, 0.5, 1.1)])
     np.testing.assert_allclose(terms, [policy_loss, value_loss, entropy, approx_kl, 4 / 5], rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(loss, policy_loss + 0.5 * value_loss - 0.1 * entropy, rtol=1e-5)
+
+
+def test_options_are_drawn_from_the_policy():
+    policy, rng = Policy(2, (3,)), np.random.default_rng(0)
+    shapes = jax.eval_shape(lambda: policy.init(jax.random.key(0), 1, jnp.zeros(())))
+    params = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=leaf.shape), jnp.float32), shapes)
+    agent = ppo.Agent(EXECUTOR, params, normalize.init((1,)), policy)
+    obs, noise = (jnp.asarray(rng.normal(size=(4, size)), jnp.float32) for size in (1, 2))
+    mean, std = np.asarray(policy.distribution(params, obs).mean()), np.exp(np.asarray(params.log_std))
+    for exploration in (1.0, 0.5, 0.0):
+        option, log_prob = agent.decide(exploration)(obs, noise)
+        np.testing.assert_allclose(option, mean + exploration * std * np.asarray(noise), rtol=1e-5)
+        np.testing.assert_allclose(log_prob, stats.norm.logpdf(option, mean, std).sum(axis=1), rtol=1e-4)
 
 
 @pytest.fixture(scope="module")
