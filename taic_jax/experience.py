@@ -82,7 +82,7 @@ class ExperienceStore:
     Args:
       folder: made if missing.
       capacity: number of blocks kept.
-      description: what the experience is of; saved as JSON and compared on reading.
+      description: what the experience is of; saved beside the blocks as JSON.
     """
 
     def __init__(self, folder: Path, capacity: int, description: dict):

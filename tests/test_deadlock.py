@@ -23,7 +23,7 @@ def init(key: jax.Array) -> tuple:
     """Initialise every network there is."""
     key_policy, key_options = jax.random.split(key)
     config = OptionsConfig(length=2, hidden_size=16, mlp_sizes=(16,))
-    policy = Policy(config.size, (16, 16)).init(key_policy, 5, jnp.zeros(()))
+    policy = Policy(config.size, (16,)).init(key_policy, 5, jnp.zeros(()))
     return policy, init_params(make_networks(config, 5, 3), config, key_options)
 
 

@@ -195,8 +195,9 @@ train_alone, train_together = jax.jit(train), jax.jit(jax.vmap(train))
 def test_vmapped_runs_are_the_runs_alone(learning_rates, seeds):
     configs = [as_arrays(dataclasses.replace(ONE_STEP, epochs=2, learning_rate=rate)) for rate in learning_rates]
     keys = [jax.random.key(seed) for seed in seeds]
-    together = train_together(jax.tree.map(lambda *leaves: jnp.stack(leaves), *configs), jnp.stack(keys))
-    alone = [train_alone(config, key) for config, key in zip(configs, keys, strict=True)]
+    stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *configs)
+    together = jax.device_get(train_together(stacked, jnp.stack(keys)))
+    alone = [jax.device_get(train_alone(config, key)) for config, key in zip(configs, keys, strict=True)]
     for k in range(2):
         assert_trees_equal(jax.tree.map(lambda x, k=k: x[k], together), alone[k], rtol=1e-4, atol=1e-5)
     assert (alone[0][0].params.log_std != alone[1][0].params.log_std).all()
