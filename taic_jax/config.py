@@ -108,10 +108,14 @@ class OptionsConfig:
     """Weight of L_pred, which makes the code's effect predictable."""
     max_grad_norm: float = 1.0
     """Global norm at which gradients are clipped."""
+    since: float = 0.0
+    """Share of the experience before the first window."""
+    until: float = 1.0
+    """Share of the experience before the last window."""
     select: Literal["random", "top"] = "top"
-    """Which episodes of the experience to learn from: any, or those of the highest return."""
+    """Which of these windows to learn from: all, or those that collected most reward."""
     fraction: float = 0.5
-    """Share of the episodes to learn from."""
+    """Share of the windows that select top keeps."""
     termination: Literal["fixed"] = "fixed"
     """When an option ends; fixed: after length ticks (Fix-len)."""
 
@@ -157,6 +161,8 @@ CONFIG_CLASSES = (EnvConfig, PPOConfig, CollectConfig, OptionsConfig, TrainConfi
 # Closed intervals by field name. Other integers are at least 1, other floats at least 0.
 TINY = 1e-6
 BOUNDS: dict[str, tuple[float, float]] = {
+    "since": (0, 1),
+    "until": (0, 1),
     "num_threads": (0, math.inf),
     "seed": (0, 2**31 - 1),
     "video_ticks": (0, math.inf),
@@ -178,6 +184,9 @@ def validate(config: Config) -> None:
     ticks, length = config.train.ppo.rollout_length, config.options.length
     if length > ticks:
         raise _impossible("options.length", length, f"at most train.ppo.rollout_length = {ticks}", ticks)
+    since, until = config.options.since, config.options.until
+    if since >= until:
+        raise _impossible("options.since", since, f"less than options.until = {until}", 0.0)
 
 
 def walk(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:

@@ -154,6 +154,8 @@ IMPOSSIBLE = [
     ("options.mlp_sizes", (), 64),
     ("options.length", 513, 512),
     ("options.fraction", 1.5, 1),
+    ("options.since", 1.0, 0.0),
+    ("options.until", 1.1, 1),
     ("evaluate.video_ticks", -1, 0),
     ("env.num_threads", -2, 0),
     ("train.ppo.lambda_", 1.5, 1),

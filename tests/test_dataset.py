@@ -65,6 +65,16 @@ def test_no_window_straddles_an_episode_end(done, seed):
     assert [score[w] for w in top] == sorted(score.values(), reverse=True)[: len(top)]
 
 
+@pytest.mark.parametrize(
+    ("since", "until", "ticks"), [(0.0, 0.5, range(6)), (0.25, 0.75, range(3, 9)), (0.5, 1.0, range(6, 12))]
+)
+def test_windows_start_between_since_and_until(since, until, ticks):
+    done = np.zeros((T, B), bool)
+    config = as_arrays(OptionsConfig(length=LENGTH, select="random", since=since, until=until))
+    dataset = jax.jit(make_dataset)(make_experience(done), config)
+    assert set(selected(dataset)) == {(t, b) for t, b in valid_starts(done) if t in ticks}
+
+
 def test_windows_hold_their_own_environments_ticks():
     done = np.zeros((T, B), bool)
     done[5, 1] = True

@@ -59,11 +59,13 @@ def window_score(reward: Float[Array, "T B"], done: Array, length: int) -> tuple
 def make_dataset(experience: Experience, config: OptionsConfig) -> Dataset:
     """Select windows of `config.length` ticks and measure the scales over them.
 
-    `select="top"` keeps the `fraction` of valid windows that collected most reward (§4.2.2),
-    `select="random"` keeps all of them.
+    Windows start between the shares `since` and `until` of the experience. Of these, `select="top"` keeps the
+    `fraction` that collected most reward (§4.2.2), `select="random"` keeps all.
     """
-    num_envs = experience.reward.shape[1]
+    num_ticks, num_envs = experience.reward.shape
     score, valid = window_score(experience.reward, experience.done, config.length)
+    when = (jnp.arange(num_ticks, dtype=jnp.float32) / num_ticks)[:, None]
+    valid = valid & (config.since <= when) & (when < config.until)
     score, valid = score.reshape(-1), valid.reshape(-1)
     count = jnp.sum(valid, dtype=jnp.int32)
     if config.select == "top":
