@@ -4,68 +4,151 @@ if __name__ == "envs":  # would be a second copy of every class
     raise ImportError("this folder is the package `taic_jax.envs`; import it by that name")
 
 import ctypes.util
-import functools
 import os
 import sys
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
 
 # MuJoCo chooses how to draw when it is first imported. Its own choice needs a display. EGL does not, but
 # where that library is missing, to ask for it would make the import fail.
 if sys.platform == "linux" and "DISPLAY" not in os.environ and ctypes.util.find_library("EGL"):
     os.environ.setdefault("MUJOCO_GL", "egl")
 
-from taic_jax.envs.adapters import BRAX_PREFIX, BraxEnv
+from taic_jax.envs.adapters import BRAX_PREFIX, PLAYGROUND_PREFIX, BraxEnv, PlaygroundEnv
+from taic_jax.envs.ant_tasks import AntArena, AntTurn
+from taic_jax.envs.arenas import FALL, MAZE, PUSH
 from taic_jax.envs.base import Env, PhysicsState, State
-from taic_jax.envs.errors import RenderingError, UnknownNameError
-from taic_jax.envs.locomotion import ANT, HALF_CHEETAH, Locomotion
+from taic_jax.envs.contract import check_contract
+from taic_jax.envs.custom import load_custom
+from taic_jax.envs.errors import ContractError, EnvOptionError, MissingExtraError, RenderingError, UnknownNameError
+from taic_jax.envs.locomotion import Locomotion
 from taic_jax.envs.navigation import Navigation
+from taic_jax.envs.physics import BACKENDS
+from taic_jax.envs.robots import ROBOTS
 from taic_jax.envs.wrappers import AutoReset, TimeLimit, Wrapper
 
 __all__ = [
+    "AntArena",
+    "AntTurn",
     "AutoReset",
     "BraxEnv",
+    "ContractError",
     "Env",
+    "EnvOptionError",
     "Locomotion",
+    "MissingExtraError",
     "Navigation",
     "PhysicsState",
+    "PlaygroundEnv",
     "RenderingError",
     "State",
     "TimeLimit",
     "UnknownNameError",
     "Wrapper",
+    "check_contract",
     "environment_names",
+    "environment_options",
     "make_env",
 ]
 
-_NAVIGATION = {
-    "nav2d": Navigation,
-    "nav2d_random": functools.partial(Navigation, random_ends=True),
+# Of the options of `make_env`, their values when not given.
+_DEFAULTS = {"pipeline": "spring", "model": "brax", "body": "gym", "goal": "fixed", "change_after": 0}
+
+
+class _Task(NamedTuple):
+    """How to make a task, from `backend`, `num_threads` where it has an engine, and these options."""
+
+    make: Callable[..., Env]
+    options: tuple[str, ...] = ()
+    has_engine: bool = True
+
+
+def _make_robot(name: str, model: str, backend: str, num_threads: int) -> Env:
+    if model not in ROBOTS:
+        raise UnknownNameError("model", model, ROBOTS)
+    return Locomotion(name, ROBOTS[model][name], backend, num_threads)
+
+
+_TASKS = {
+    "nav2d": _Task(Navigation, ("change_after",), has_engine=False),
+    "nav2d_random": _Task(partial(Navigation, random_ends=True), has_engine=False),
+    **{name: _Task(partial(_make_robot, name), ("model",)) for name in ROBOTS["brax"]},
+    "ant_turn": _Task(partial(AntTurn, "ant_turn", ROBOTS["brax"]["ant"])),
+    "ant_maze": _Task(partial(AntArena, "ant_maze", MAZE), ("body", "goal")),
+    "ant_push": _Task(partial(AntArena, "ant_push", PUSH), ("body",)),
+    "ant_fall": _Task(partial(AntArena, "ant_fall", FALL), ("body",)),
 }
-_ROBOTS = {"ant": ANT, "half_cheetah": HALF_CHEETAH}
 
 
 def environment_names() -> tuple[str, ...]:
-    """List the tasks `make_env` knows, besides `brax:NAME` for every environment registered with Brax."""
-    return (*_NAVIGATION, *_ROBOTS)
+    """List the tasks of this package; `make_env` also knows others' by prefix and the user's own by file or module."""
+    return tuple(_TASKS)
 
 
-def make_env(name: str, backend: str = "auto", *, num_threads: int | None = None, pipeline: str = "spring") -> Env:
+def environment_options(name: str) -> tuple[str, ...]:
+    """List the options of `make_env` that a task takes, besides backend and number of threads.
+
+    Raises:
+      UnknownNameError: if there is no such task; the message names the nearest.
+    """
+    return _find(name).options
+
+
+def make_env(
+    name: str,
+    backend: str = "auto",
+    *,
+    num_threads: int = 0,
+    pipeline: str = "spring",
+    model: str = "brax",
+    body: str = "gym",
+    goal: str = "fixed",
+    change_after: int = 0,
+) -> Env:
     """Make a task by name, with its time limit.
 
     Args:
-      name: one of `environment_names()`, or `brax:NAME`.
-      backend: physics of the MuJoCo tasks, `auto`, `mujoco` or `mjx` (see `physics.make_physics`).
-      num_threads: threads of the `mujoco` backend; None or 0 takes one per physical core.
+      name: one of `environment_names()`; `brax:NAME` or `playground:NAME` for an environment of those packages;
+        `FILE.py:CLASS` or `MODULE:CLASS` for your own.
+      backend: physics of the MuJoCo tasks, `auto`, `mujoco`, `mjx` or `warp` (see `physics.make_physics`).
+      num_threads: threads of the `mujoco` backend; 0 takes one per physical core.
       pipeline: physics of `brax:NAME`: `spring`, `positional`, `generalized` or `mjx`.
+      model: MJCF and rules of the running robots: `brax`, or `gym` for Gymnasium's own.
+      body: of the ant in an arena: `gym`, the one of `ant`, or `hiro`.
+      goal: of the maze: `fixed`, or `uniform`.
+      change_after: episodes after which the room of `nav2d` changes; 0 for never.
 
     Raises:
-      UnknownNameError: if there is no such task, backend or pipeline; the message names the nearest.
+      UnknownNameError: if there is no such task or value; the message names the nearest.
+      EnvOptionError: if the task has no such option.
+      MissingExtraError: if it needs a package that is not installed.
+      ContractError: if an environment from elsewhere breaks the contract of `Env`.
     """
-    if name.startswith(BRAX_PREFIX):
-        env = BraxEnv(name.removeprefix(BRAX_PREFIX), pipeline)
-    elif name in _NAVIGATION:
-        env = _NAVIGATION[name]()
-    elif name in _ROBOTS:
-        env = Locomotion(_ROBOTS[name], backend, num_threads or 0)
-    else:
-        raise UnknownNameError("environment", name, (*environment_names(), f"{BRAX_PREFIX}NAME"))
+    task = _find(name)
+    if backend not in BACKENDS:
+        raise UnknownNameError("backend", backend, BACKENDS)
+    given = {"pipeline": pipeline, "model": model, "body": body, "goal": goal, "change_after": change_after}
+    for option, value in given.items():
+        if value != _DEFAULTS[option] and option not in task.options:
+            raise EnvOptionError(name, option, value, task.options)
+    options: dict[str, Any] = {option: given[option] for option in task.options}
+    if task.has_engine:
+        options |= {"backend": backend, "num_threads": num_threads}
+    env = task.make(**options)
+    if name not in _TASKS:
+        check_contract(env)
     return TimeLimit(env, env.episode_length)
+
+
+def _find(name: str) -> _Task:
+    if name in _TASKS:
+        return _TASKS[name]
+    if name.startswith(BRAX_PREFIX):
+        return _Task(partial(BraxEnv, name.removeprefix(BRAX_PREFIX)), ("pipeline",), has_engine=False)
+    if name.startswith(PLAYGROUND_PREFIX):
+        return _Task(partial(PlaygroundEnv, name.removeprefix(PLAYGROUND_PREFIX)), has_engine=False)
+    if ":" in name:
+        return _Task(partial(load_custom, name))
+    others = (f"{BRAX_PREFIX}NAME", f"{PLAYGROUND_PREFIX}NAME", "FILE.py:CLASS")
+    raise UnknownNameError("environment", name, (*_TASKS, *others))

@@ -46,6 +46,13 @@ class Env(abc.ABC):
     def reset(self, key: Key[Array, ""]) -> State:
         """Draw the first state of an episode; consumes the key."""
 
+    def restart(self, key: Key[Array, ""], ended: Any) -> State:
+        """Draw the first state of the episode after one that ended in physics `ended`; by default any first state.
+
+        A task that changes from episode to episode overrides this.
+        """
+        return self.reset(key)
+
     @abc.abstractmethod
     def step(self, state: State, action: Float[Array, " A"]) -> State:
         """Advance by one tick under an action in [-1, 1]^A, which the caller has clipped."""

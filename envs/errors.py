@@ -14,5 +14,39 @@ class UnknownNameError(ValueError):
         super().__init__(f"unknown {kind} {given!r}: {hint}valid: {', '.join(valid)}")
 
 
+class MissingExtraError(ImportError, ValueError):
+    """A package that is not installed; the message gives the line that installs it, None being no extra."""
+
+    def __init__(self, package: str, extra: str | None):
+        wanted = f"taic-jax[{extra}]" if extra else "taic-jax"
+        super().__init__(f"the package {package} is not installed: pip install '{wanted}'", name=package)
+
+
+class BackendError(ValueError):
+    """A physics backend that does not run on this machine."""
+
+    def __init__(self, backend: str, needed: str):
+        super().__init__(f"env.backend: {backend} needs {needed}; the nearest that runs here is mjx")
+
+
+class EnvOptionError(ValueError):
+    """An option of `make_env` that the task does not have."""
+
+    def __init__(self, task: str, option: str, value: object, options: Iterable[str]):
+        known = ", ".join(options) or "none"
+        super().__init__(f"env.{option}: {task} has no such option, got {value!r}; its options: {known}")
+
+
+class AdapterError(ValueError):
+    """An environment that cannot stand on the other side of an adapter, or is used there against the rules."""
+
+
+class ContractError(ValueError):
+    """An environment that breaks the contract of `Env`; the message starts with its name and the field."""
+
+    def __init__(self, environment: str, field: str, problem: str):
+        super().__init__(f"{environment}: {field}: {problem}")
+
+
 class RenderingError(RuntimeError):
     """This machine cannot draw MuJoCo scenes."""

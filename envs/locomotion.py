@@ -1,52 +1,17 @@
-"""Running tasks with the semantics of Gym's MuJoCo environments, version 1, on the MJCF that Brax ships."""
+"""Running tasks with the semantics of Gym's MuJoCo environments, and the ant that turns."""
 
-import dataclasses
-import importlib.util
 import math
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jax import Array
-from jaxtyping import Float, Key
+from jaxtyping import Bool, Float, Key
 
 from taic_jax.envs.base import Env, PhysicsState, State
 from taic_jax.envs.physics import make_physics
-
-_METRICS = ("forward_reward", "healthy_reward", "control_cost", "x_velocity")
-
-
-@dataclasses.dataclass(frozen=True)
-class Robot:
-    """What a running task takes from its body: the model, and the constants of Gym's reward, start and end.
-
-    `name` is the task's and the MJCF file's.
-    """
-
-    name: str
-    num_unobserved: int  # leading entries of qpos left out of obs: the place on the ground
-    control_cost: float  # weight of |action|^2
-    healthy_reward: float = 0.0  # a tick
-    healthy_height: tuple[float, float] = (-math.inf, math.inf)  # m; outside it the episode ends
-    height_index: int = 1  # entry of qpos that is the torso's height
-    substeps: int = 5
-    reset_noise: float = 0.1  # half-width on qpos (uniform), standard deviation on qvel (normal)
-    episode_length: int = 1000  # ticks
-    iterations: int | None = None  # of MJX's solver; None for the model's own
-    ls_iterations: int | None = 4  # of its line search
-
-
-HALF_CHEETAH = Robot("half_cheetah", num_unobserved=1, control_cost=0.1)
-ANT = Robot(
-    "ant",
-    num_unobserved=2,
-    control_cost=0.5,
-    healthy_reward=1.0,
-    healthy_height=(0.2, 1.0),
-    height_index=2,
-)
+from taic_jax.envs.robots import Robot, compile_spec, initial_qpos, load_spec
 
 
 class Locomotion(Env):
@@ -57,15 +22,18 @@ class Locomotion(Env):
     last finite state.
 
     Args:
+      name: the task's.
       robot: the body's description.
       backend: see `make_physics`.
       num_threads: see `make_physics`.
     """
 
-    def __init__(self, robot: Robot, backend: str = "auto", num_threads: int = 0):
+    episode_length = 1000  # ticks
+
+    def __init__(self, name: str, robot: Robot, backend: str = "auto", num_threads: int = 0):
+        self.name = name
         self.robot = robot
-        self.name = robot.name
-        self.model = load_brax_model(robot.name)
+        self.model = self._make_model()
         self.physics = make_physics(
             self.model,
             robot.substeps,
@@ -75,51 +43,42 @@ class Locomotion(Env):
             ls_iterations=robot.ls_iterations,
         )
         self.action_size = self.model.nu
-        self.observation_size = self.model.nq - robot.num_unobserved + self.model.nv
-        self.proprioceptive_size = self.observation_size
-        self.episode_length = robot.episode_length
         self.dt = self.model.opt.timestep * robot.substeps
-        self._init_qpos = jnp.asarray(initial_qpos(self.model), jnp.float32)
+        self._init_qpos = jnp.asarray(self._start(), jnp.float32)
+        state = jax.eval_shape(self.reset, jax.random.key(0))
+        self.observation_size = self.proprioceptive_size = state.obs.shape[0]
 
     def reset(self, key: Key[Array, ""]) -> State:
         """Start near the initial pose, with Gym's noise."""
         # One draw, turned normal for the velocities: hashing is most of a reset, to compile and to run.
         nq, above_minus_one = self.model.nq, float(np.nextafter(np.float32(-1.0), np.float32(0.0)))
-        uniform = jax.random.uniform(key, (nq + self.model.nv,), minval=above_minus_one)
-        normal = math.sqrt(2.0) * jax.scipy.special.erfinv(uniform[nq:])
-        scale = self.robot.reset_noise
-        physics = self.physics.init(self._init_qpos + scale * uniform[:nq], scale * normal)
+        noise = jax.random.uniform(key, (nq + self.model.nv,), minval=above_minus_one)
+        if self.robot.velocity_noise == "normal":
+            noise = jnp.concatenate([noise[:nq], math.sqrt(2.0) * jax.scipy.special.erfinv(noise[nq:])])
+        noise = self.robot.reset_noise * noise
+        physics = self._begin(self.physics.init(self._init_qpos + noise[:nq], noise[nq:]))
         zero, no = jnp.zeros(()), jnp.zeros((), bool)
+        _, metrics = self._judge(physics, physics, jnp.zeros(self.action_size))
         return State(
             physics=physics,
             obs=self._observe(physics),
             reward=zero,
             terminated=no,
             truncated=no,
-            metrics=dict.fromkeys(_METRICS, zero),
+            metrics=jax.tree.map(jnp.zeros_like, metrics),
         )
 
     def step(self, state: State, action: Float[Array, " A"]) -> State:
         """Simulate one tick and pay for it."""
         before, after = state.physics, self.physics.step(state.physics, action)
         finite = jnp.all(jnp.isfinite(jnp.concatenate([after.qpos, after.qvel])))
-        after = jax.tree.map(lambda new, old: jnp.where(finite, new, old), after, before)
-        velocity = (after.qpos[0] - before.qpos[0]) / self.dt
-        healthy_reward = jnp.float32(self.robot.healthy_reward)
-        control_cost = self.robot.control_cost * jnp.sum(action**2)
-        low, high = self.robot.healthy_height
-        height = after.qpos[self.robot.height_index]
-        metrics = {
-            "forward_reward": velocity,
-            "healthy_reward": healthy_reward,
-            "control_cost": control_cost,
-            "x_velocity": velocity,
-        }
+        after = self._advance(before, jax.tree.map(lambda new, old: jnp.where(finite, new, old), after, before))
+        reward, metrics = self._judge(before, after, action)
         return state.replace(
             physics=after,
             obs=self._observe(after),
-            reward=velocity + healthy_reward - control_cost,
-            terminated=~finite | (height < low) | (height > high),
+            reward=reward,
+            terminated=~finite | ~self._is_healthy(after),
             truncated=jnp.zeros((), bool),
             metrics=metrics,
         )
@@ -130,26 +89,53 @@ class Locomotion(Env):
 
         return render_mujoco(self.model, physics.qpos, height=height, width=width)
 
+    def _make_model(self) -> mujoco.MjModel:
+        return compile_spec(load_spec(self.robot))
+
+    def _start(self) -> Float[np.ndarray, " nq"]:
+        return initial_qpos(self.robot, self.model)
+
+    def _begin(self, physics: PhysicsState) -> PhysicsState:
+        """Add what a task remembers besides the simulation."""
+        return physics
+
+    def _advance(self, before: PhysicsState, after: PhysicsState) -> PhysicsState:
+        """Bring up to date what a task remembers besides the simulation."""
+        return after
+
     def _observe(self, physics: PhysicsState) -> Float[Array, " S"]:
-        return jnp.concatenate([physics.qpos[self.robot.num_unobserved :], physics.qvel])
+        robot, position = self.robot, physics.qpos
+        if robot.root_height:
+            position = position.at[robot.height_index].add(robot.root_height)
+        limit = robot.velocity_limit
+        velocity = physics.qvel if math.isinf(limit) else jnp.clip(physics.qvel, -limit, limit)
+        return jnp.concatenate([position[robot.num_unobserved :], velocity])
 
+    def _is_healthy(self, physics: PhysicsState) -> Bool[Array, ""]:
+        robot = self.robot
+        low, high = robot.healthy_height
+        height = physics.qpos[robot.height_index] + robot.root_height
+        healthy = (height >= low) & (height <= high)
+        if not math.isinf(robot.healthy_angle):
+            healthy &= jnp.abs(physics.qpos[2]) < robot.healthy_angle
+        if not math.isinf(robot.healthy_state):
+            rest = jnp.concatenate([physics.qpos[2:], physics.qvel])
+            healthy &= jnp.all(jnp.abs(rest) < robot.healthy_state)
+        return healthy
 
-def load_brax_model(name: str) -> mujoco.MjModel:
-    """Compile a robot from the MJCF in the brax package, found without importing brax (which is slow)."""
-    brax = importlib.util.find_spec("brax")
-    if brax is None or brax.origin is None:
-        raise ModuleNotFoundError("the robots' MJCF comes with the package brax, which is not installed")
-    spec = mujoco.MjSpec.from_file(str(Path(brax.origin).parent / "envs" / "assets" / f"{name}.xml"))
-    # MuJoCo deprecates the attribute `settotalmass`, with a warning; this is the replacement it asks for.
-    total_mass, spec.compiler.settotalmass = spec.compiler.settotalmass, -1
-    model = spec.compile()
-    if total_mass > 0:
-        mujoco.mj_setTotalmass(model, total_mass)
-        mujoco.mj_setConst(model, mujoco.MjData(model))
-    return model
+    def _judge(
+        self, before: PhysicsState, after: PhysicsState, action: Float[Array, " A"]
+    ) -> tuple[Float[Array, ""], dict[str, Array]]:
+        """Return the tick's reward and metrics."""
+        robot = self.robot
+        healthy_reward = jnp.float32(robot.healthy_reward)
+        if robot.healthy_reward and not robot.final_healthy_reward:
+            healthy_reward = jnp.where(self._is_healthy(after), healthy_reward, 0.0)
+        control_cost = robot.control_cost * jnp.sum(action**2)
+        progress, metrics = self._progress(before, after)
+        metrics |= {"healthy_reward": healthy_reward, "control_cost": control_cost}
+        return progress + healthy_reward - control_cost, metrics
 
-
-def initial_qpos(model: mujoco.MjModel) -> Float[np.ndarray, " nq"]:
-    """Return the pose that the model's custom numeric `init_qpos` holds, else its default pose."""
-    index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, "init_qpos")
-    return model.qpos0 if index < 0 else model.numeric("init_qpos").data
+    def _progress(self, before: PhysicsState, after: PhysicsState) -> tuple[Float[Array, ""], dict[str, Array]]:
+        velocity = (after.qpos[0] - before.qpos[0]) / self.dt
+        return velocity, {"forward_reward": velocity, "x_velocity": velocity}

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import Array
-from jaxtyping import Bool, Float, Key
+from jaxtyping import Bool, Float, Int, Key
 
 from taic_jax.envs.base import Env, State
 
@@ -22,11 +22,17 @@ BASE_MAP = np.array(
 )
 
 
+# What appears later (section 4.1, figure 4): a pocket behind the wall's lower gap. Who takes the shortest way is
+# caught 1.8 m behind that gap; only the upper one still leads to the goal.
+TRAP = np.array([[7.0, 3.0, 7.4, 7.0], [5.2, 2.8, 7.4, 3.2], [5.2, 6.8, 7.4, 7.2]], np.float32)
+
+
 class NavigationState(struct.PyTreeNode):
-    """Where the point is, and where it shall go."""
+    """Where the point is, where it shall go, and how often it has tried."""
 
     position: Array  # [2] m
     goal: Array  # [2] m
+    episode: Array  # [] int32, episodes of this environment that ended before
 
 
 class Navigation(Env):
@@ -38,6 +44,7 @@ class Navigation(Env):
     Args:
       walls: rectangles [R, 4] in m; may be traced, so that a program can change the map without recompiling.
       random_ends: draw start and goal uniformly from free space each episode, and observe the goal.
+      change_after: episodes of each environment after which `TRAP` stands in the room too; 0 for never.
     """
 
     action_size = 2
@@ -45,22 +52,38 @@ class Navigation(Env):
     episode_length = 200
     dt = 0.2
 
-    def __init__(self, walls: Float[Array | np.ndarray, "R 4"] = BASE_MAP, random_ends: bool = False):
+    def __init__(
+        self,
+        walls: Float[Array | np.ndarray, "R 4"] = BASE_MAP,
+        random_ends: bool = False,
+        change_after: int = 0,
+    ):
         self.name = "nav2d_random" if random_ends else "nav2d"
         self.observation_size = 4 if random_ends else 2
         self.random_ends = random_ends
-        self.walls = jnp.asarray(walls)
+        self.change_after = change_after
+        # From which episode each wall stands there.
+        since = [0] * len(walls) + [change_after] * len(TRAP)
+        self.walls = jnp.concatenate([jnp.asarray(walls), TRAP]) if change_after else jnp.asarray(walls)
+        self._since = np.array(since[: len(self.walls)], np.int32)
         if random_ends:
             self._cells, self._num_cells = free_cells(self.walls)
 
     def reset(self, key: Key[Array, ""]) -> State:
         """Put the point on its start."""
+        return self._start(key, jnp.zeros((), jnp.int32))
+
+    def restart(self, key: Key[Array, ""], ended: NavigationState) -> State:
+        """Put the point on its start, in the room as it is after one more episode."""
+        return self._start(key, ended.episode + 1)
+
+    def _start(self, key: Key[Array, ""], episode: Int[Array, ""]) -> State:
         position, goal = jnp.array(START), jnp.array(GOAL)
         if self.random_ends:
             position, goal = jax.vmap(self._free_point)(jax.random.uniform(key, (2, 3)))
-        physics = NavigationState(position=position, goal=goal)
+        physics = NavigationState(position=position, goal=goal, episode=episode)
         no = jnp.zeros((), bool)
-        metrics = {"distance_to_goal": jnp.linalg.norm(goal - position), "success": jnp.zeros(())}
+        metrics = self._metrics(physics)
         return State(
             physics=physics,
             obs=self._observe(physics),
@@ -74,18 +97,19 @@ class Navigation(Env):
         """Move by one tick, first along x, then along y."""
         x, y = state.physics.position
         new_x, new_y = jnp.clip(state.physics.position + MAX_SPEED * self.dt * action, 0.0, ROOM)
-        x = jnp.where(inside(jnp.stack([new_x, y]), self.walls), x, new_x)
-        y = jnp.where(inside(jnp.stack([x, new_y]), self.walls), y, new_y)
+        standing = self._standing(state.physics.episode[None])
+        x = jnp.where(inside(jnp.stack([new_x, y]), self.walls, standing), x, new_x)
+        y = jnp.where(inside(jnp.stack([x, new_y]), self.walls, standing), y, new_y)
         physics = state.physics.replace(position=jnp.stack([x, y]))
-        distance = jnp.linalg.norm(physics.goal - physics.position)
-        success = distance <= GOAL_RADIUS
+        metrics = self._metrics(physics)
+        success = metrics["success"] > 0
         return state.replace(
             physics=physics,
             obs=self._observe(physics),
             reward=jnp.where(success, jnp.float32(100.0), jnp.float32(-1.0)),
             terminated=success,
             truncated=jnp.zeros((), bool),
-            metrics={"distance_to_goal": distance, "success": success.astype(jnp.float32)},
+            metrics=metrics,
         )
 
     def render(self, physics: NavigationState, *, height: int = 240, width: int = 320) -> np.ndarray:
@@ -94,6 +118,7 @@ class Navigation(Env):
 
         return render_room(
             np.asarray(self.walls),
+            np.asarray(self._standing(np.asarray(physics.episode)[:, None])),
             physics.position,
             physics.goal,
             size=ROOM,
@@ -107,15 +132,28 @@ class Navigation(Env):
         points = [physics.position, physics.goal] if self.random_ends else [physics.position]
         return jnp.concatenate(points) / (ROOM / 2) - 1.0
 
+    def _metrics(self, physics: NavigationState) -> dict[str, Array]:
+        distance = jnp.linalg.norm(physics.goal - physics.position)
+        metrics = {"distance_to_goal": distance, "success": (distance <= GOAL_RADIUS).astype(jnp.float32)}
+        if self.change_after:
+            metrics["changed"] = (physics.episode >= self.change_after).astype(jnp.float32)
+        return metrics
+
+    def _standing(self, episode: Int[Array | np.ndarray, "*T 1"]) -> Bool[Array | np.ndarray, "*T R"]:
+        """Tell which walls stand in which episode."""
+        return self._since <= episode
+
     def _free_point(self, uniform: Float[Array, " 3"]) -> Float[Array, " 2"]:
         """Map [0, 1)^3 to free space, uniformly and without rejections: a cell, then a place in it."""
         cell = self._cells[(uniform[0] * self._num_cells).astype(jnp.int32)]
         return cell + CELL * uniform[1:]
 
 
-def inside(point: Float[Array, " 2"], walls: Float[Array, "R 4"]) -> Bool[Array, ""]:
-    """Tell whether a point lies in any of the rectangles; their edges belong to them."""
-    return jnp.any(jnp.all((walls[:, :2] <= point[None]) & (point[None] <= walls[:, 2:]), axis=1))
+def inside(
+    point: Float[Array, " 2"], walls: Float[Array, "R 4"], standing: Bool[Array | np.ndarray, " R"]
+) -> Bool[Array, ""]:
+    """Tell whether a point lies in any of the standing rectangles; their edges belong to them."""
+    return jnp.any(standing & jnp.all((walls[:, :2] <= point[None]) & (point[None] <= walls[:, 2:]), axis=1))
 
 
 @jax.jit

@@ -2,14 +2,16 @@
 
 import os
 import sys
+from pathlib import Path
 
 import matplotlib.figure
 import matplotlib.patches
 import mujoco
 import numpy as np
 from jax import Array
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from PIL import Image
 
 from taic_jax.envs.errors import RenderingError
 
@@ -18,22 +20,40 @@ Frames = UInt8[np.ndarray, "T height width 3"]
 _FLOOR, _WALL, _GOAL, _POINT = "#f4f1ea", "#3d4451", "#3a9d5d", "#d1495b"
 
 
-def render_mujoco(model: mujoco.MjModel, qpos: Float[Array | np.ndarray, "T nq"], *, height: int, width: int) -> Frames:
-    """Draw a trajectory of poses, from the model's camera `track` where it has one.
+def render_mujoco(
+    model: mujoco.MjModel,
+    qpos: Float[Array | np.ndarray, "T nq"],
+    *,
+    height: int,
+    width: int,
+    camera: str = "track",
+    site: Float[np.ndarray, "T 3"] | None = None,
+) -> Frames:
+    """Draw a trajectory of poses.
+
+    Args:
+      model: compiled model.
+      qpos: the poses.
+      height: pixels.
+      width: pixels.
+      camera: name of the model's camera; where it has none of that name, a free one looks at the whole scene.
+      site: places in m for the model's first site, which marks a goal.
 
     Raises:
       RenderingError: if there is no OpenGL.
     """
     model.vis.global_.offwidth = max(model.vis.global_.offwidth, width)
     model.vis.global_.offheight = max(model.vis.global_.offheight, height)
-    camera = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, "track")  # -1, a free one, if there is none
+    camera_id = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, camera)  # -1 means a free one
     data = mujoco.MjData(model)
     frames = []
     with _make_renderer(model, height, width) as renderer:
-        for pose in np.asarray(qpos):
+        for t, pose in enumerate(np.asarray(qpos)):
             data.qpos[:] = pose
             mujoco.mj_forward(model, data)
-            renderer.update_scene(data, camera)
+            if site is not None:
+                data.site_xpos[0] = site[t]
+            renderer.update_scene(data, camera_id)
             frames.append(renderer.render())
     return np.stack(frames)
 
@@ -52,6 +72,7 @@ def _make_renderer(model: mujoco.MjModel, height: int, width: int) -> mujoco.Ren
 
 def render_room(
     walls: Float[np.ndarray, "R 4"],
+    standing: Bool[np.ndarray, "T R"],
     position: Float[Array | np.ndarray, "T 2"],
     goal: Float[Array | np.ndarray, "T 2"],
     *,
@@ -63,7 +84,8 @@ def render_room(
 ) -> Frames:
     """Draw a point's way through the room [0, size]^2: obstacles, start, goal, and the episode's path so far.
 
-    A move longer than `longest_move` is a reset: there a new path starts.
+    `standing` says at which ticks a wall is there. A move longer than `longest_move` is a reset: there a new path
+    starts.
     """
     dpi = height / 2.4  # lines and dots grow with the frame
     figure = matplotlib.figure.Figure(figsize=(width / dpi, height / dpi), dpi=dpi, facecolor="white")
@@ -72,8 +94,11 @@ def render_room(
     axes.set(xticks=[], yticks=[], facecolor=_FLOOR)
     for spine in axes.spines.values():
         spine.set(color=_WALL, linewidth=2)
-    for x, y, x_high, y_high in walls:
-        axes.add_patch(matplotlib.patches.Rectangle((x, y), x_high - x, y_high - y, color=_WALL))
+    patches = [
+        matplotlib.patches.Rectangle((x, y), x_high - x, y_high - y, color=_WALL) for x, y, x_high, y_high in walls
+    ]
+    for patch in patches:
+        axes.add_patch(patch)
     target = matplotlib.patches.Circle((0, 0), goal_radius, color=_GOAL, alpha=0.6, linewidth=0)
     axes.add_patch(target)
     (path,) = axes.plot([], [], color=_POINT, linewidth=1.5, alpha=0.7, solid_capstyle="round")
@@ -85,6 +110,8 @@ def render_room(
     for t, here in enumerate(position):
         if np.abs(here - position[max(t - 1, 0)]).max() > longest_move:
             begin = t
+        for patch, stands in zip(patches, standing[t], strict=True):
+            patch.set_visible(stands)
         target.set_center(goal[t])
         path.set_data(*position[begin : t + 1].T)
         start.set_data(*position[begin : begin + 1].T)
@@ -92,3 +119,10 @@ def render_room(
         canvas.draw()
         frames.append(np.asarray(canvas.buffer_rgba())[..., :3].copy())
     return np.stack(frames)
+
+
+def write_webp(path: Path, frames: Frames, dt: float) -> None:
+    """Write frames that are `dt` seconds apart as an animation in real time, at most 25 a second."""
+    every = max(round(0.04 / dt), 1)
+    images = [Image.fromarray(frame) for frame in frames[::every]]
+    images[0].save(path, save_all=True, append_images=images[1:], duration=round(1000 * dt * every), loop=0)

@@ -26,6 +26,10 @@ class Wrapper(Env):
         """Reset the inner environment."""
         return self.env.reset(key)
 
+    def restart(self, key: Key[Array, ""], ended: Any) -> State:
+        """Restart the inner environment."""
+        return self.env.restart(key, ended)
+
     def step(self, state: State, action: Float[Array, " A"]) -> State:
         """Step the inner environment."""
         return self.env.step(state, action)
@@ -46,10 +50,15 @@ class TimeLimit(Wrapper):
         """Reset with the count of ticks at zero."""
         return self.env.reset(key).replace(tick=jnp.zeros((), jnp.int32))
 
+    def restart(self, key: Key[Array, ""], ended: Any) -> State:
+        """Restart with the count of ticks at zero."""
+        return self.env.restart(key, ended).replace(tick=jnp.zeros((), jnp.int32))
+
     def step(self, state: State, action: Float[Array, " A"]) -> State:
         """Step and count the tick."""
         tick = state.tick + 1
-        state = self.env.step(state, action)
+        no = jnp.zeros((), bool)  # for a task that leaves them as they were
+        state = self.env.step(state.replace(terminated=no, truncated=no), action)
         return state.replace(tick=tick, truncated=state.truncated | (tick >= self.episode_length))
 
 
@@ -84,7 +93,7 @@ class AutoReset(Wrapper):
         """Put a fresh start where an episode ended; all arguments have the leading axes of `ended`."""
 
         def restart(ended: Array, key: Array, running: Any) -> Any:
-            start = self.env.reset(key)
+            start = self.env.restart(key, running[0])
             start = (start.physics, start.obs, start.tick)
             return jax.tree.map(lambda new, old: jnp.where(ended, new, old), start, running)
 

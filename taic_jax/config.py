@@ -20,13 +20,21 @@ class EnvConfig:
     """The environment and the engine that runs its physics."""
 
     name: str = "nav2d"
-    """Environment: nav2d, nav2d_random, half_cheetah, ant, or brax:NAME for one of Brax's own."""
-    backend: Literal["auto", "mujoco", "mjx"] = "auto"
+    """Environment: a task of this package, brax:NAME, playground:NAME, FILE.py:CLASS or MODULE:CLASS."""
+    backend: Literal["auto", "mujoco", "mjx", "warp"] = "auto"
     """Physics engine; auto takes mujoco (C, all cores) on CPU and mjx (JAX) elsewhere."""
     num_threads: int = 0
     """Threads of the mujoco backend; 0 takes the physical cores."""
     pipeline: str = "spring"
     """Physics pipeline of the brax:NAME environments."""
+    model: Literal["brax", "gym"] = "brax"
+    """MJCF and rules of half_cheetah, ant, hopper and walker2d: Brax's, or Gymnasium's own."""
+    body: Literal["gym", "hiro"] = "gym"
+    """Ant of ant_maze, ant_push and ant_fall: the one of ant, or HIRO's weaker one."""
+    goal: Literal["fixed", "uniform"] = "fixed"
+    """Goal of ant_maze: always the same, or drawn in each episode."""
+    change_after: int = 0
+    """Episodes of each environment after which the room of nav2d changes; 0 for never."""
 
 
 @dataclass(frozen=True)
@@ -163,6 +171,7 @@ TINY = 1e-6
 BOUNDS: dict[str, tuple[float, float]] = {
     "since": (0, 1),
     "until": (0, 1),
+    "change_after": (0, math.inf),
     "num_threads": (0, math.inf),
     "seed": (0, 2**31 - 1),
     "video_ticks": (0, math.inf),

@@ -1,5 +1,6 @@
 """The main job: collect experience, learn options, train a policy over them, evaluate."""
 
+import dataclasses
 import json
 import shutil
 import sys
@@ -16,7 +17,7 @@ from jaxtyping import Array
 from taic_jax.checkpoint import save_tree
 from taic_jax.config import Config, ConfigError, PPOConfig
 from taic_jax.config_io import to_yaml
-from taic_jax.envs import make_env
+from taic_jax.envs import environment_options, make_env
 from taic_jax.envs.base import Env
 from taic_jax.envs.errors import RenderingError
 from taic_jax.evaluate import evaluate
@@ -121,10 +122,12 @@ def make_envs(config: Config) -> tuple[Env, Env]:
     Raises:
       ConfigError: options learnt in one do not fit the other.
     """
-    wanted = config.env
-    make = partial(make_env, num_threads=wanted.num_threads or None, pipeline=wanted.pipeline)
-    env = make(wanted.name, wanted.backend)
-    source = make(config.collect.env, wanted.backend) if config.collect.env else env
+    options = dataclasses.asdict(config.env)
+    name = options.pop("name")
+    env = source = make_env(name, **options)
+    if config.collect.env:
+        kept = ("backend", "num_threads", *environment_options(config.collect.env))
+        source = make_env(config.collect.env, **{option: options[option] for option in kept})
     bodies = [(e.proprioceptive_size, e.action_size) for e in (source, env)]
     if bodies[0] != bodies[1]:
         raise ConfigError(

@@ -8,7 +8,6 @@ from typing import Any
 
 import jax
 import numpy as np
-from PIL import Image
 
 from taic_jax.config import Config
 from taic_jax.envs.base import Env
@@ -87,6 +86,8 @@ def commit() -> str | None:
 
 def write_video(run: Run, env: Env, agent: Agent) -> None:
     """Write `video.webp`: the first seed's policy taking its mean options."""
+    from taic_jax.envs.rendering import write_webp  # it imports matplotlib, which takes a while
+
     ticks = run.config.evaluate.video_ticks
     if not ticks:
         return
@@ -94,10 +95,3 @@ def write_video(run: Run, env: Env, agent: Agent) -> None:
     key = run.stage_keys("video")[0]
     physics = run.compile(lambda agent, key: record(env, agent, key, ticks), agent, key)(agent, key)
     write_webp(run.dir / "video.webp", env.render(jax.device_get(physics)), env.dt)
-
-
-def write_webp(path: Path, frames: np.ndarray, dt: float) -> None:
-    """Write frames [T, H, W, 3] as an animation in real time, at most 25 a second."""
-    every = max(round(0.04 / dt), 1)
-    images = [Image.fromarray(frame) for frame in frames[::every]]
-    images[0].save(path, save_all=True, append_images=images[1:], duration=round(1000 * dt * every), loop=0)

@@ -12,7 +12,15 @@ import pytest
 
 from taic_jax.envs import PhysicsState, make_env
 
-NAMES = ("half_cheetah", "ant")
+NAMES = ("half_cheetah", "ant", "hopper", "walker2d")
+# From Gym's sources, version 1: sizes of obs and action, seconds a tick, weight of |a|^2, bonus for health.
+GYM = {
+    "half_cheetah": (17, 6, 0.05, 0.1, 0.0),
+    "ant": (27, 8, 0.05, 0.5, 1.0),
+    "hopper": (11, 3, 0.008, 1e-3, 1.0),
+    "walker2d": (17, 6, 0.008, 1e-3, 1.0),
+}
+MASSES = {"half_cheetah": 14.0, "ant": 0.911, "hopper": 15.82, "walker2d": 23.677}
 
 
 @functools.cache
@@ -32,13 +40,13 @@ def states_at(name: str, qpos, qvel):
     return state.replace(physics=physics)
 
 
-@pytest.mark.parametrize(("name", "sizes"), [("half_cheetah", (17, 6)), ("ant", (27, 8))], ids=("half_cheetah", "ant"))
-def test_sizes_and_times_are_gyms(name, sizes):
+@pytest.mark.parametrize("name", NAMES)
+def test_sizes_and_times_are_gyms(name):
     env, *_ = task(name)
-    assert (env.observation_size, env.action_size) == sizes
+    assert (env.observation_size, env.action_size) == GYM[name][:2]
     assert env.proprioceptive_size == env.observation_size
     assert env.episode_length == 1000
-    assert env.dt == pytest.approx(0.05)
+    assert env.dt == pytest.approx(GYM[name][2])
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -50,37 +58,65 @@ def test_model_is_the_one_brax_ships(name, monkeypatch, tmp_path):
     theirs = mujoco.MjModel.from_xml_path(str(folder / f"envs/assets/{name}.xml"))
     for field in ("body_mass", "body_inertia", "dof_invweight0", "geom_size", "jnt_range", "actuator_gear"):
         np.testing.assert_array_equal(getattr(ours, field), getattr(theirs, field))
-    assert mujoco.mj_getTotalmass(ours) == pytest.approx({"half_cheetah": 14.0, "ant": 0.911}[name], abs=1e-3)
+    assert mujoco.mj_getTotalmass(ours) == pytest.approx(MASSES[name], abs=1e-3)
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_tick_and_reward_are_those_of_the_engine_in_double_precision(name):
-    """Gym-v1: x from qpos[0], 5 engine steps in 0.05 s; cheetah 0.1 |a|^2, ant 0.5 |a|^2 and 1 for health."""
+    """Gym-v1: x from qpos[0], the torso's height from its body, velocities of the planar walkers clipped at 10."""
     env, _, step = task(name)
+    _, _, dt, weight, health = GYM[name]
     rng = np.random.default_rng(0)
     data, actions = mujoco.MjData(env.model), rng.uniform(-1, 1, (8, env.action_size)).astype(np.float32)
     start = np.array(env.model.qpos0)
     if name == "ant":
         start = np.array([0, 0, 0.55, 1, 0, 0, 0, 0, 1, 0, -1, 0, -1, 0, 1.0])
     qpos = (start + rng.uniform(-0.1, 0.1, (8, env.model.nq))).astype(np.float32)
-    qvel = rng.normal(0, 0.1, (8, env.model.nv)).astype(np.float32)
+    qvel = rng.normal(0, 8.0 if name in ("hopper", "walker2d") else 0.1, (8, env.model.nv)).astype(np.float32)
     after = step(states_at(name, qpos, qvel), actions)
+    clipped = 0
     for i in range(8):
         mujoco.mj_resetData(env.model, data)
         data.qpos[:], data.qvel[:], data.ctrl[:] = qpos[i], qvel[i], actions[i]
-        for _ in range(5):
+        for _ in range(round(dt / env.model.opt.timestep)):
             mujoco.mj_step(env.model, data)
-        forward = (data.qpos[0] - float(qpos[i, 0])) / 0.05
-        cost = {"half_cheetah": 0.1, "ant": 0.5}[name] * float(np.sum(actions[i].astype(np.float64) ** 2))
-        health = {"half_cheetah": 0.0, "ant": 1.0}[name]
-        skipped = {"half_cheetah": 1, "ant": 2}[name]
-        np.testing.assert_allclose(after.obs[i], np.concatenate([data.qpos[skipped:], data.qvel]), rtol=1e-5, atol=1e-5)
-        np.testing.assert_allclose(after.reward[i], forward + health - cost, atol=2e-5)
+        mujoco.mj_kinematics(env.model, data)
+        obs = np.concatenate([data.qpos[2 if name == "ant" else 1 :], data.qvel])
+        if name in ("hopper", "walker2d"):
+            obs[0] = data.body("torso").xpos[2]
+            clipped += np.sum(np.abs(data.qvel) > 10)
+            obs[-env.model.nv :] = np.clip(data.qvel, -10, 10)
+        forward = (data.qpos[0] - float(qpos[i, 0])) / dt
+        cost = weight * float(np.sum(actions[i].astype(np.float64) ** 2))
+        np.testing.assert_allclose(after.obs[i], obs, rtol=1e-5, atol=2e-5)
+        np.testing.assert_allclose(after.reward[i], forward + health - cost, atol=1e-4)
         metrics = {key: value[i] for key, value in after.metrics.items()}
-        np.testing.assert_allclose(metrics["forward_reward"], forward, atol=2e-5)
-        np.testing.assert_allclose(metrics["x_velocity"], forward, atol=2e-5)
+        np.testing.assert_allclose(metrics["forward_reward"], forward, atol=1e-4)
+        np.testing.assert_allclose(metrics["x_velocity"], forward, atol=1e-4)
         np.testing.assert_allclose(metrics["control_cost"], cost, rtol=1e-5)
         assert metrics["healthy_reward"] == health
+    assert clipped or name not in ("hopper", "walker2d"), "no velocity is large enough to be clipped"
+
+
+@pytest.mark.parametrize(
+    ("name", "entry", "ends"),
+    [
+        ("hopper", ("qpos", 1), [(-0.4, False), (-0.6, True), (2.0, False)]),  # height 1.25 + this, above 0.7
+        ("hopper", ("qpos", 2), [(0.19, False), (0.21, True), (-0.21, True)]),
+        ("hopper", ("qvel", 3), [(99.0, False), (101.0, True)]),
+        ("walker2d", ("qpos", 1), [(-0.4, False), (-0.5, True), (0.7, False), (0.8, True)]),
+        ("walker2d", ("qpos", 2), [(0.95, False), (1.05, True), (-1.05, True)]),
+        ("walker2d", ("qvel", 3), [(101.0, False)]),
+    ],
+)
+def test_walkers_end_where_gym_ends_them(name, entry, ends):
+    env = task(name)[0].env
+    field, index = entry
+    for value, ended in ends:
+        state = {"qpos": np.zeros(env.model.nq, np.float32), "qvel": np.zeros(env.model.nv, np.float32)}
+        state[field][index] = value
+        physics = PhysicsState(jnp.array(state["qpos"]), jnp.array(state["qvel"]), jnp.zeros(env.model.nv))
+        assert bool(env._is_healthy(physics)) != ended, (entry, value)
 
 
 def test_ant_ends_outside_its_healthy_heights():
@@ -115,7 +151,16 @@ def test_divergence_ends_the_episode_in_the_last_finite_state(name, monkeypatch,
     np.testing.assert_array_equal(after.obs, again.obs)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", ["hopper", "walker2d"])
+def test_walkers_start_with_gyms_small_noise(name):
+    env, reset, _ = task(name)
+    physics = reset(jax.random.split(jax.random.key(0), 4000)).physics
+    noise = np.concatenate([np.asarray(physics.qpos) - np.asarray(env.env._init_qpos), physics.qvel], axis=1)
+    assert np.abs(noise).max() <= 5e-3 + 1e-7
+    np.testing.assert_allclose(noise.std(0), 5e-3 / np.sqrt(3), rtol=0.04)  # uniform on +-0.005
+
+
+@pytest.mark.parametrize("name", ["half_cheetah", "ant"])
 def test_starts_have_gyms_noise(name):
     env, reset, _ = task(name)
     physics = reset(jax.random.split(jax.random.key(0), 4000)).physics

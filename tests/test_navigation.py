@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from taic_jax.envs import Navigation, make_env
-from taic_jax.envs.navigation import BASE_MAP, NavigationState, inside
+from taic_jax.envs import AutoReset, Navigation, make_env
+from taic_jax.envs.navigation import BASE_MAP, TRAP, inside
 
 ENV = Navigation()
 STEP = jax.jit(ENV.step)
@@ -15,7 +15,7 @@ STEP = jax.jit(ENV.step)
 def state_at(env: Navigation, position):
     """Return a state of the point there."""
     state = jax.jit(env.reset)(jax.random.key(0))
-    return state.replace(physics=NavigationState(jnp.array(position), jnp.array((9.0, 5.0))))
+    return state.replace(physics=state.physics.replace(position=jnp.array(position)))
 
 
 @pytest.mark.parametrize(
@@ -94,7 +94,7 @@ def test_random_task_draws_free_points_uniformly():
         (state.physics.goal, state.obs[:, 2:]),
     ):
         np.testing.assert_allclose(observed, points / 5 - 1, atol=1e-6)
-        assert not jax.vmap(inside, (0, None))(points, env.walls).any()
+        assert not jax.vmap(inside, (0, None, None))(points, env.walls, np.ones(4, bool)).any()
         # Free space: 100 - 1.6 - 1.0 - 1.5 - 0.6 = 95.3 m^2, of which left of the wall 48 - 1.5 = 46.5, and
         # in its two gaps 0.4 * (2 + 1.5) = 1.4.
         x = np.asarray(points[:, 0])
@@ -117,3 +117,43 @@ def test_map_is_data_within_one_program():
     blocked = jnp.concatenate([jnp.asarray(BASE_MAP[:3]), jnp.array([[7.0, 3.0, 7.4, 7.0]])])
     np.testing.assert_allclose([way(jnp.asarray(BASE_MAP)), way(blocked)], [7.1, 6.9], atol=1e-6)
     assert len(traces) == 1
+
+
+def test_the_room_changes_after_so_many_episodes_of_each_environment():
+    """Straight ahead: two episodes reach the goal, then the trap holds the point, in one program, for each alone."""
+    env = AutoReset(make_env("nav2d", change_after=2))
+    start = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 2))
+
+    def tick(state, t):
+        # The second environment waits ten ticks before its first move.
+        state = jax.vmap(env.step)(state, jnp.array([[1.0, 0.0], [jnp.where(t < 10, 0.0, 1.0), 0.0]]))
+        return state, (state.terminated, state.truncated, state.metrics["changed"], state.physics.position)
+
+    ticks = jax.jit(lambda state: jax.lax.scan(tick, state, jnp.arange(2 * 38 + 10 + 200)))(start)[1]
+    terminated, truncated, changed, position = jax.tree.map(np.asarray, ticks)
+    for env_index, wait in ((0, 0), (1, 10)):
+        assert np.flatnonzero(terminated[:, env_index]).tolist() == [37 + wait, 75 + wait]
+        assert np.flatnonzero(truncated[:, env_index]).tolist() == [275 + wait]
+        assert changed[: 76 + wait, env_index].sum() == 0 and changed[76 + wait : 276 + wait, env_index].all()
+        # 1.8 m behind the gap's end at 5.2 m, less than one move of 0.2 m before the wall at 7 m.
+        np.testing.assert_allclose(position[150, env_index], [6.9, 5.0], atol=0.1)
+
+
+def test_only_the_upper_gap_leads_through_the_changed_room():
+    """Flood the room's raster from the start: the goal is reached in both rooms, but not through the trap."""
+
+    def ways(walls):
+        axis = np.arange(0.05, 10, 0.1)
+        x, y = np.meshgrid(axis, axis, indexing="ij")
+        free = ~np.any([(a <= x) & (x <= c) & (b <= y) & (y <= d) for a, b, c, d in walls], axis=0)
+        reached, frontier, steps = {(10, 50)}, [(10, 50)], 0
+        while frontier and (90, 50) not in reached:
+            near = {(i + di, j + dj) for i, j in frontier for di, dj in ((1, 0), (-1, 0), (0, 1), (0, -1))}
+            near = {(i, j) for i, j in near - reached if 0 <= i < 100 and 0 <= j < 100 and free[i, j]}
+            reached, frontier, steps = reached | near, list(near), steps + 1
+        return steps if (90, 50) in reached else None
+
+    no_upper_gap = np.array([[4.8, 8.5, 5.2, 10.0]], np.float32)
+    assert ways(BASE_MAP) == 80
+    assert ways(np.concatenate([BASE_MAP, TRAP])) > 120
+    assert ways(np.concatenate([BASE_MAP, TRAP, no_upper_gap])) is None

@@ -9,7 +9,7 @@ from taic_jax.envs.physics.mujoco import MujocoPhysics
 
 __all__ = ["BACKENDS", "MujocoPhysics", "Physics", "make_physics"]
 
-BACKENDS = ("auto", "mujoco", "mjx")
+BACKENDS = ("auto", "mujoco", "mjx", "warp")
 
 
 def make_physics(
@@ -26,13 +26,15 @@ def make_physics(
     Args:
       model: compiled model.
       substeps: engine steps a tick.
-      backend: `mujoco` (C engine, host's cores), `mjx` (JAX), or `auto`: `mujoco` where JAX runs on CPU.
+      backend: `mujoco` (C engine, host's cores), `mjx` (JAX), `warp` (MJX on MuJoCo Warp, NVIDIA only), or `auto`:
+        `mujoco` where JAX runs on CPU, else `mjx`.
       num_threads: threads of the `mujoco` backend; 0 takes one per physical core.
-      iterations: solver iterations on `mjx`, None for the model's own.
-      ls_iterations: line-search iterations on `mjx`, None for the model's own.
+      iterations: solver iterations on `mjx` and `warp`, None for the model's own.
+      ls_iterations: line-search iterations likewise.
 
     Raises:
       UnknownNameError: if there is no such backend.
+      MissingExtraError: if the backend needs a package or a device that is not there.
     """
     if backend not in BACKENDS:
         raise UnknownNameError("backend", backend, BACKENDS)
@@ -42,4 +44,4 @@ def make_physics(
         return MujocoPhysics(model, substeps, num_threads)
     from taic_jax.envs.physics.mjx import MjxPhysics  # MJX takes a second to import
 
-    return MjxPhysics(model, substeps, iterations, ls_iterations)
+    return MjxPhysics(model, substeps, iterations, ls_iterations, warp=backend == "warp")

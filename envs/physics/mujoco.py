@@ -68,7 +68,7 @@ class MujocoPhysics(Physics):
             cpu=buffer_callback(self._step_buffer, shape, vmap_method="broadcast_all"),
             default=lambda sent: jax.pure_callback(self._step_copy, shape, sent, vmap_method="broadcast_all"),
         )
-        return PhysicsState(qpos=after[:nq], qvel=after[nq : nq + nv], qacc_warmstart=after[nq + nv :])
+        return state.replace(qpos=after[:nq], qvel=after[nq : nq + nv], qacc_warmstart=after[nq + nv :])
 
     def _step_buffer(self, context: Any, after: Any, sent: Any) -> None:
         """Step in XLA's own memory: on CPU, where `pure_callback` takes ten times as long to hand arrays over."""

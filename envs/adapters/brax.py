@@ -1,6 +1,6 @@
-"""Other libraries' environments behind `Env`."""
+"""Brax's environments behind `Env`, and ours for Brax's wrappers and trainers."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -9,9 +9,13 @@ from flax import struct
 from jax import Array
 from jaxtyping import Float, Key
 
+from taic_jax.envs.adapters.admission import require_vector_actions, require_vector_obs, strong
 from taic_jax.envs.base import Env, State
-from taic_jax.envs.errors import UnknownNameError
+from taic_jax.envs.errors import AdapterError, UnknownNameError
 from taic_jax.envs.third_party import third_party
+
+if TYPE_CHECKING:
+    from taic_jax.envs.adapters.brax_export import BraxExport
 
 BRAX_PREFIX = "brax:"
 BRAX_PIPELINES = ("spring", "positional", "generalized", "mjx")
@@ -33,7 +37,7 @@ class BraxEnv(Env):
 
     Raises:
       UnknownNameError: if there is no such environment or pipeline.
-      ValueError: if its observation is not one vector.
+      AdapterError: if Brax refuses the pipeline, the observation is not one vector, or actions have no limits.
     """
 
     episode_length = 1000  # ticks
@@ -49,14 +53,18 @@ class BraxEnv(Env):
             raise UnknownNameError("pipeline", pipeline, BRAX_PIPELINES)
         self.name = BRAX_PREFIX + name
         with third_party():
-            self.brax_env: Any = brax_envs.get_environment(name, backend=pipeline)
+            try:
+                self.brax_env: Any = brax_envs.get_environment(name, backend=pipeline)
+            except ValueError as error:
+                raise AdapterError(f"{self.name}: the pipeline {pipeline!r} does not fit: {error}") from error
+            actuator = getattr(getattr(self.brax_env, "sys", None), "actuator", None)
+            limits = None if actuator is None else np.asarray(actuator.ctrl_range)
+            require_vector_actions(self.name, self.brax_env, limits)
             self.action_size = self.brax_env.action_size
             self.dt = float(getattr(self.brax_env, "dt", 1.0))  # `fast`, a test of Brax's own, has no clock
             start = jax.eval_shape(self.brax_env.reset, jax.random.key(0))
-        if not hasattr(start.obs, "shape") or len(start.obs.shape) != 1:
-            raise ValueError(f"{self.name}: the observation must be one vector, got {start.obs}")
         self._state_type = type(start)
-        self.observation_size = self.proprioceptive_size = start.obs.shape[0]
+        self.observation_size = self.proprioceptive_size = require_vector_obs(self.name, start.obs)
 
     def reset(self, key: Key[Array, ""]) -> State:
         """Reset by Brax's own rule."""
@@ -86,13 +94,30 @@ class BraxEnv(Env):
 
 
 def _from_brax(state: Any) -> State:
-    """Convert Brax's state; every dtype is made strong, for a carry that is the same after reset and step."""
-    physics = BraxPhysics(pipeline_state=state.pipeline_state, info=state.info)
+    """Convert Brax's state."""
     return State(
-        physics=jax.tree.map(lambda leaf: jax.lax.convert_element_type(leaf, leaf.dtype), physics),
+        physics=strong(BraxPhysics(pipeline_state=state.pipeline_state, info=state.info)),
         obs=jnp.asarray(state.obs, jnp.float32),
         reward=jnp.asarray(state.reward, jnp.float32),
         terminated=jnp.asarray(state.done, bool),
         truncated=jnp.zeros((), bool),
         metrics={name: jnp.asarray(value, jnp.float32) for name, value in state.metrics.items()},
     )
+
+
+def to_brax(env: Env) -> "BraxExport":
+    """Turn an environment of ours into a `brax.envs.Env`, for Brax's wrappers and trainers.
+
+    Brax counts the ticks, in its `EpisodeWrapper`, so a `TimeLimit` around `env` is taken off; its number is
+    still there as `episode_length`, to be passed on: `training.wrap(to_brax(env), env.episode_length)`. At an
+    episode's end Brax goes back to the copy's first state, so starts do not vary, nor does a task's `restart` act.
+    With JAX 0.10, Brax 0.14.2's PPO stops, for any environment, at a function that JAX took away
+    (`device_put_replicated`); its wrappers work.
+
+    Raises:
+      AdapterError: `env` is none of ours, resets itself, or has its time limit inside another wrapper.
+    """
+    with third_party():
+        from taic_jax.envs.adapters.brax_export import BraxExport
+
+    return BraxExport(env)

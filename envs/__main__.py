@@ -1,0 +1,161 @@
+"""Draw every task: a picture and a short animation of each, and one sheet of them all.
+
+python -m taic_jax.envs --out pictures --contact-sheet pictures/all.png
+"""
+
+import contextlib
+import dataclasses
+import difflib
+import io
+import math
+import re
+import sys
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import jax
+import numpy as np
+import tyro
+from jax import Array
+from jaxtyping import Key, UInt8
+from PIL import Image, ImageDraw, ImageFont
+
+from taic_jax.envs import AutoReset, Env, RenderingError, State, environment_names, make_env
+from taic_jax.envs.rendering import write_webp
+
+PROGRAM = "python -m taic_jax.envs"
+HEIGHT, WIDTH = 300, 400  # pixels of every picture
+GAP, CAPTION = 20, 36  # pixels between the tiles of the sheet, and below each for its name
+INK, PAPER, FRAME = "#3d4451", "#ffffff", "#c9ccd2"
+MEMORY = 10  # ticks in which the random actions lose most of their past: shorter ones make a body only shiver
+SPREAD = 0.8  # their standard deviation, before they are clipped
+
+
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+    """Draw tasks under smooth random actions: NAME.png and NAME.webp for each."""
+
+    out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("pictures")
+    """Folder for the pictures."""
+    tasks: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME")] = ()
+    """Tasks to draw, by any name that make_env takes; none means all of this package."""
+    contact_sheet: Annotated[Path | None, tyro.conf.arg(metavar="FILE.png")] = None
+    """Also write one picture that shows all tasks with their names."""
+    ticks: int = 100
+    """Length of the animations."""
+
+
+class ArgumentError(ValueError):
+    """A mistake in the arguments, told in one line."""
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Draw, and return the exit code: 0, or 2 where the arguments or this machine do not allow it."""
+    try:
+        draw(parse(sys.argv[1:] if args is None else args))
+    except (ValueError, OSError, RenderingError) as error:
+        ours = type(error).__module__.partition(".")[0] in ("taic_jax", __name__)
+        if not ours and not isinstance(error, OSError):
+            raise
+        print("taic_jax: error:", " ".join(str(error).split()), file=sys.stderr)
+        return 2
+    return 0
+
+
+def parse(args: Sequence[str]) -> Arguments:
+    """Parse the arguments.
+
+    Raises:
+      ArgumentError: an argument is not valid.
+    """
+    try:
+        with contextlib.redirect_stderr(io.StringIO()):
+            arguments = tyro.cli(Arguments, prog=PROGRAM, args=args)
+    except SystemExit as stop:
+        if not stop.code:
+            raise
+        known = ["--" + field.name.replace("_", "-") for field in dataclasses.fields(Arguments)]
+        for option in (arg.partition("=")[0] for arg in args if arg.startswith("--")):
+            if option.replace("_", "-") not in known:
+                nearest = difflib.get_close_matches(option, known, n=1, cutoff=0.0)[0]
+                raise ArgumentError(f"unknown option {option}; the nearest is {nearest}") from None
+        raise ArgumentError(f"expected {', '.join(known)} with their values, got {' '.join(args)!r}") from None
+    if arguments.ticks < 1:
+        raise ArgumentError(f"--ticks: expected at least 1, got {arguments.ticks}; the nearest valid value is 1")
+    sheet = arguments.contact_sheet
+    if sheet and sheet.suffix.lower() != ".png":
+        raise ArgumentError(f"--contact-sheet: expected a .png file, got {sheet}; the nearest is {sheet}.png")
+    return arguments
+
+
+def draw(arguments: Arguments) -> None:
+    """Write the pictures, and print the path of each; a mistake in a name is told before any is written."""
+    envs = [make_env(name) for name in arguments.tasks or environment_names()]
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    tiles = {}
+    for env in envs:
+        key = jax.random.key(zlib.crc32(env.name.encode()) >> 1)  # its own, but the same whatever else is drawn
+        states = jax.device_get(random_episodes(env, key, arguments.ticks))
+        frames = env.render(states.physics, height=HEIGHT, width=WIDTH)
+        path = arguments.out / re.sub(r"[^\w-]+", "_", env.name)
+        tiles[env.name] = frames[still(states.terminated | states.truncated)]
+        Image.fromarray(tiles[env.name]).save(path.with_suffix(".png"))
+        write_webp(path.with_suffix(".webp"), frames, env.dt)
+        print(path.with_suffix(".png"), path.with_suffix(".webp"), sep="\n", flush=True)
+    if arguments.contact_sheet:
+        arguments.contact_sheet.parent.mkdir(parents=True, exist_ok=True)
+        contact_sheet(tiles).save(arguments.contact_sheet)
+        print(arguments.contact_sheet)
+
+
+def random_episodes(env: Env, key: Key[Array, ""], ticks: int) -> State:
+    """Act at random but smoothly, with automatic resets; return the states after each tick, leading axis T.
+
+    The actions are white noise through a first-order filter: as the body is slow, it would average white
+    noise away and hardly move.
+    """
+    env, keep = AutoReset(env), math.exp(-1.0 / MEMORY)
+    key_reset, key_start, key_noise = jax.random.split(key, 3)
+
+    def tick(carry: tuple[State, Array], noise: Array) -> tuple[tuple[State, Array], State]:
+        state, drift = carry
+        drift = keep * drift + math.sqrt(1.0 - keep**2) * noise
+        state = env.step(state, (SPREAD * drift).clip(-1.0, 1.0))
+        return (state, drift), state
+
+    @jax.jit
+    def episodes() -> State:
+        noise = jax.random.normal(key_noise, (ticks, env.action_size))
+        start = (env.reset(key_reset), jax.random.normal(key_start, (env.action_size,)))
+        return jax.lax.scan(tick, start, noise)[1].replace(key=None)
+
+    return episodes()
+
+
+def still(ended: np.ndarray) -> int:
+    """Choose the tick to show of `ended` [T]: the middle of the longest episode, where nothing has just begun."""
+    edges = np.concatenate([[0], np.flatnonzero(ended), [len(ended)]])
+    longest = np.argmax(np.diff(edges))
+    return int((edges[longest] + edges[longest + 1]) // 2)
+
+
+def contact_sheet(tiles: dict[str, UInt8[np.ndarray, "height width 3"]]) -> Image.Image:
+    """Lay pictures of one size on a grid, each with its name below; the grid has as few empty places as possible."""
+    height, width, _ = next(iter(tiles.values())).shape
+    columns = min(range(3, 6), key=lambda n: (-len(tiles) % n, abs(n - 4))) if len(tiles) > 3 else len(tiles)
+    rows = math.ceil(len(tiles) / columns)
+    across, down = width + GAP, height + CAPTION + GAP
+    sheet = Image.new("RGB", (columns * across + GAP, rows * down + GAP), PAPER)
+    brush, font = ImageDraw.Draw(sheet), ImageFont.load_default(0.6 * CAPTION)
+    for index, (name, picture) in enumerate(tiles.items()):
+        x, y = GAP + index % columns * across, GAP + index // columns * down
+        sheet.paste(Image.fromarray(picture), (x, y))
+        brush.rectangle((x - 1, y - 1, x + width, y + height), outline=FRAME, width=2)
+        brush.text((x + width / 2, y + height + CAPTION / 2), name, INK, font, anchor="mm")
+    return sheet
+
+
+if __name__ == "__main__":
+    sys.exit(main())

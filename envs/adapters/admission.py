@@ -1,0 +1,81 @@
+"""What an adapter asks of an environment before it lets it through, each refused in one line."""
+
+import contextlib
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from taic_jax.envs.base import Env, State
+from taic_jax.envs.errors import AdapterError, MissingExtraError
+
+
+@contextlib.contextmanager
+def extra(name: str) -> Iterator[None]:
+    """Import packages of an extra of ours.
+
+    Raises:
+      MissingExtraError: one of them is not installed; the message gives the line that installs it.
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        raise MissingExtraError((error.name or str(error)).partition(".")[0], name) from error
+
+
+def require_vector_actions(name: str, env: Any, limits: Float[np.ndarray, "A 2"] | None = None) -> None:
+    """Refuse actions that a vector in [-1, 1]^A cannot stand for.
+
+    Args:
+      name: the environment's, for the message.
+      env: any library's environment; its `action_space` is looked at where it has one.
+      limits: of every action, low and high; None if they are not known.
+
+    Raises:
+      AdapterError: the actions are discrete, composite or without limits.
+    """
+    space: Any = getattr(env, "action_space", None)
+    if any(hasattr(space, attribute) for attribute in ("n", "nvec", "spaces")):
+        raise AdapterError(f"{name}: actions: got {space}, expected one vector of numbers with limits")
+    if limits is None and hasattr(space, "low"):
+        limits = np.stack([np.ravel(space.low), np.ravel(space.high)], axis=1)
+    if limits is not None and not np.isfinite(limits).all():
+        index = int(np.argmin(np.isfinite(limits).all(axis=1)))
+        low, high = (float(limit) for limit in limits[index])
+        raise AdapterError(f"{name}: actions: action {index} is in [{low}, {high}], expected finite limits")
+
+
+def require_vector_obs(name: str, obs: Any) -> int:
+    """Return the length of an abstract observation.
+
+    Raises:
+      AdapterError: it is not one vector.
+    """
+    if len(getattr(obs, "shape", ())) != 1:
+        shapes = jax.tree.map(lambda leaf: leaf.shape, obs)
+        raise AdapterError(f"{name}: obs: got the shapes {shapes}, expected one vector [S]")
+    return obs.shape[0]
+
+
+def require_task(adapter: str, env: Any) -> State:
+    """Return the abstract first state of one of our environments that shall leave through an adapter.
+
+    Raises:
+      AdapterError: it is none of ours, or starts the next episode by itself, which the other side does.
+    """
+    require_vector_actions(adapter, env)
+    if not isinstance(env, Env):
+        kind = f"{type(env).__module__}.{type(env).__qualname__}"
+        raise AdapterError(f"{adapter}: got {kind}, expected a taic_jax.envs.Env, as make_env returns")
+    start = jax.eval_shape(env.reset, jax.random.key(0))
+    if start.key is not None:
+        raise AdapterError(f"{adapter}: {env.name} is in AutoReset, expected the environment inside it")
+    return start
+
+
+def strong(tree: Any) -> Any:
+    """Make every dtype strong, for a carry that is the same after reset and step."""
+    arrays = jax.tree.map(jax.numpy.asarray, tree)
+    return jax.tree.map(lambda leaf: jax.lax.convert_element_type(leaf, leaf.dtype), arrays)

@@ -1,0 +1,85 @@
+"""Our environments as Brax's; imports Brax."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from brax.envs import base
+from jax import Array
+
+from taic_jax.envs.adapters.admission import require_task
+from taic_jax.envs.base import Env, State
+from taic_jax.envs.errors import AdapterError
+from taic_jax.envs.wrappers import TimeLimit
+
+
+class BraxExport(base.Env):
+    """An environment of ours as a `brax.envs.Env` (see `to_brax`).
+
+    `pipeline_state` is our `physics`, and `done` says that the task itself ended. Actions are clipped to [-1, 1].
+    """
+
+    def __init__(self, env: Env):
+        require_task("to_brax", env)
+        self.episode_length = env.episode_length  # ticks
+        self.dt = env.dt
+        while isinstance(env, TimeLimit):
+            env = env.env
+        start = require_task("to_brax", env)
+        if start.tick is not None:
+            raise AdapterError(
+                f"to_brax: {env.name} has its TimeLimit inside {type(env).__name__}, expected it outside"
+            )
+        self.env = env
+        self._metrics = tuple(start.metrics)
+
+    @property
+    def observation_size(self) -> int:
+        """Return the length of the observation."""
+        return self.env.observation_size
+
+    @property
+    def action_size(self) -> int:
+        """Return the length of the action."""
+        return self.env.action_size
+
+    @property
+    def backend(self) -> str:
+        """Return where the physics comes from; no pipeline of Brax's."""
+        return "taic_jax"
+
+    def reset(self, rng: Array) -> base.State:
+        """Reset under one of Brax's raw keys [2] uint32, or under a typed one."""
+        typed = jnp.issubdtype(rng.dtype, jax.dtypes.prng_key)
+        state = self.env.reset(rng if typed else jax.random.wrap_key_data(rng))
+        return base.State(
+            pipeline_state=state.physics,
+            obs=state.obs,
+            reward=state.reward,
+            done=_done(state),
+            metrics=dict(state.metrics),
+            info={},
+        )
+
+    def step(self, state: Any, action: Array) -> base.State:
+        """Step; what Brax's wrappers have put into metrics and info stays there."""
+        before = State(
+            physics=state.pipeline_state,
+            obs=state.obs,
+            reward=state.reward,
+            terminated=state.done.astype(bool),
+            truncated=jnp.zeros((), bool),
+            metrics={name: state.metrics[name] for name in self._metrics},
+        )
+        after = self.env.step(before, jnp.clip(action, -1.0, 1.0))
+        return state.replace(
+            pipeline_state=after.physics,
+            obs=after.obs,
+            reward=after.reward,
+            done=_done(after),
+            metrics={**state.metrics, **after.metrics},
+        )
+
+
+def _done(state: State) -> Array:
+    return (state.terminated | state.truncated).astype(jnp.float32)

@@ -1,0 +1,184 @@
+"""What the paper's options are carried to: an ant that turns, and ants in a maze, before a block and a chasm."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jax import Array
+from jaxtyping import Bool, Float, Key
+
+from taic_jax.envs.arenas import ANT_QPOS, ANT_QVEL, Arena, furnish
+from taic_jax.envs.base import PhysicsState, State
+from taic_jax.envs.errors import UnknownNameError
+from taic_jax.envs.locomotion import Locomotion
+from taic_jax.envs.robots import ROBOTS, compile_spec, initial_qpos, load_spec
+
+SUCCESS_RADIUS = 5.0  # m, of HIRO
+
+
+class TurningState(PhysicsState):
+    """The simulation, and how far the ant has turned."""
+
+    turns: Array  # [] since the start of the episode, left is positive
+
+
+class AntTurn(Locomotion):
+    """Turn left: the reward of `ant` with the yaw rate in rad/s in place of the forward speed."""
+
+    def _begin(self, physics: PhysicsState) -> TurningState:
+        return TurningState(physics.qpos, physics.qvel, physics.qacc_warmstart, turns=jnp.zeros(()))
+
+    def _advance(self, before: TurningState, after: TurningState) -> TurningState:
+        angle = wrapped(heading(after.qpos[3:7]) - heading(before.qpos[3:7]))
+        return after.replace(turns=before.turns + angle / (2 * jnp.pi))
+
+    def _progress(self, before: TurningState, after: TurningState) -> tuple[Float[Array, ""], dict[str, Array]]:
+        rate = 2 * jnp.pi * (after.turns - before.turns) / self.dt
+        return rate, {"yaw_rate": rate, "turns": after.turns}
+
+
+class ArenaState(PhysicsState):
+    """The simulation, and what an episode remembers besides it."""
+
+    goal: Array  # [2] or [3] m
+    closest: Array  # [] m, smallest distance to the goal so far
+
+
+class AntArena(Locomotion):
+    """Reach the goal of an arena: reward = -distance in m at each tick; nothing ends the episode but its limit.
+
+    To fall over does not end it either: where every reward is negative, that would be worth it. A simulation
+    that diverges is cut, not terminated, in its last finite state.
+
+    Observation: the 27 entries of `ant`, heights from the ground of the start, so that options learnt there
+    apply; then the position [2], the way to the goal [2 or 3], and the way to the block [3] where there is one.
+
+    Args:
+      name: the task's.
+      arena: the room.
+      body: `gym`, the ant of `ant`; or `hiro`, with a fifth of its strength and ticks twice as long, 500 of them.
+      goal: `fixed`, or `uniform` in the room, as HIRO trains in its maze.
+      backend: see `make_physics`.
+      num_threads: see `make_physics`.
+
+    Raises:
+      UnknownNameError: if there is no such body or goal.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        arena: Arena,
+        body: str = "gym",
+        goal: str = "fixed",
+        backend: str = "auto",
+        num_threads: int = 0,
+    ):
+        if body not in ("gym", "hiro"):
+            raise UnknownNameError("body", body, ("gym", "hiro"))
+        if goal not in ("fixed", "uniform"):
+            raise UnknownNameError("goal", goal, ("fixed", "uniform"))
+        self.arena, self.body, self.uniform_goal = arena, body, goal == "uniform"
+        robot = dataclasses.replace(
+            ROBOTS["brax"]["ant"], start_in_default_pose=body == "hiro", iterations=4, ls_iterations=8
+        )
+        self.episode_length = 500 if body == "hiro" else 1000
+        super().__init__(name, robot, backend, num_threads)
+        self.proprioceptive_size = ANT_QPOS - robot.num_unobserved + ANT_QVEL
+
+    def reset(self, key: Key[Array, ""]) -> State:
+        """Start near the origin with Gym's noise, the block where it belongs."""
+        key_body, key_goal = jax.random.split(key)
+        state = super().reset(key_body)
+        if self.uniform_goal:
+            low, high = jnp.array(self.arena.room).reshape(2, 2)
+            goal = jax.random.uniform(key_goal, (2,), minval=low, maxval=high)
+            state = state.replace(physics=self._begin(state.physics.replace(goal=goal)))
+            state = state.replace(obs=self._observe(state.physics))
+        return state
+
+    def step(self, state: State, action: Float[Array, " A"]) -> State:
+        """Simulate one tick and measure the distance."""
+        state = super().step(state, action)
+        return state.replace(terminated=jnp.zeros((), bool), truncated=state.terminated)
+
+    def render(self, physics: ArenaState, *, height: int = 240, width: int = 320) -> np.ndarray:
+        """Draw the arena with MuJoCo's renderer, from above."""
+        from taic_jax.envs.rendering import render_mujoco
+
+        goal = np.asarray(physics.goal)
+        if goal.shape[1] == 2:
+            goal = np.concatenate([goal, np.full((len(goal), 1), 0.5, goal.dtype)], axis=1)
+        return render_mujoco(self.model, physics.qpos, height=height, width=width, camera="arena", site=goal)
+
+    def _make_model(self) -> mujoco.MjModel:
+        spec = load_spec(self.robot)
+        if self.body == "hiro":
+            spec.option.timestep, spec.option.integrator = 0.02, mujoco.mjtIntegrator.mjINT_RK4
+            for actuator in spec.actuators:
+                actuator.gear[0] = 30.0
+        furnish(spec, self.arena)
+        return compile_spec(spec)
+
+    def _start(self) -> Float[np.ndarray, " nq"]:
+        qpos = self.model.qpos0.copy()
+        if not self.robot.start_in_default_pose:
+            qpos[:ANT_QPOS] = initial_qpos(self.robot, self.model)
+            qpos[2] += self.arena.ground
+        return qpos
+
+    def _begin(self, physics: Any) -> ArenaState:
+        """Take the noise from the block, and start the record of distances."""
+        start, goal = self._init_qpos, getattr(physics, "goal", jnp.array(self.arena.goal, jnp.float32))
+        qpos = jnp.concatenate([physics.qpos[:ANT_QPOS], start[ANT_QPOS:]])
+        qvel = physics.qvel.at[ANT_QVEL:].set(0.0)
+        closest = jnp.linalg.norm(goal - qpos[: goal.shape[0]])
+        return ArenaState(qpos, qvel, physics.qacc_warmstart, goal=goal, closest=closest)
+
+    def _advance(self, before: ArenaState, after: ArenaState) -> ArenaState:
+        return after.replace(closest=jnp.minimum(before.closest, self._distance(after)))
+
+    def _distance(self, physics: ArenaState) -> Float[Array, ""]:
+        return jnp.linalg.norm(physics.goal - physics.qpos[: physics.goal.shape[0]])
+
+    def _observe(self, physics: ArenaState) -> Float[Array, " S"]:
+        torso = physics.qpos[:3]
+        body = physics.qpos[2:ANT_QPOS].at[0].add(-self.arena.ground)
+        entries = [body, physics.qvel[:ANT_QVEL], torso[:2], physics.goal - torso[: physics.goal.shape[0]]]
+        if self.arena.block:
+            entries.append(self.block_position(physics.qpos) - torso)
+        return jnp.concatenate(entries)
+
+    def block_position(self, qpos: Float[Array, " nq"]) -> Float[Array, " 3"]:
+        """Return the block's centre in m."""
+        block = self.arena.block
+        axes = jnp.array([slide.axis for slide in block.slides], jnp.float32)
+        return jnp.array(block.centre, jnp.float32) + qpos[ANT_QPOS:] @ axes
+
+    def _is_healthy(self, physics: PhysicsState) -> Bool[Array, ""]:
+        return jnp.ones((), bool)
+
+    def _judge(self, before: Any, after: Any, action: Float[Array, " A"]) -> tuple[Float[Array, ""], dict[str, Array]]:
+        distance = self._distance(after)
+        _, x, y, _ = after.qpos[3:7]
+        metrics = {
+            "distance": distance,
+            "success": (distance < SUCCESS_RADIUS).astype(jnp.float32),
+            "closest_approach": after.closest,
+            "upside_down": (x**2 + y**2 > 0.5).astype(jnp.float32),  # the torso's own z axis points down
+        }
+        return -distance, metrics
+
+
+def heading(quaternion: Float[Array, " 4"]) -> Float[Array, ""]:
+    """Return the yaw in rad of the body's x axis, projected on the ground."""
+    w, x, y, z = quaternion
+    return jnp.arctan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2))
+
+
+def wrapped(angle: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+    """Return the same angle in [-pi, pi)."""
+    return (angle + jnp.pi) % (2 * jnp.pi) - jnp.pi

@@ -1,0 +1,192 @@
+"""The three arenas of HIRO as data, and how the ant's model is put into one of them.
+
+Each is a rectangular room with at most three solids (a bar, pillars or platforms, all 4 m high) and perhaps a
+movable block. The outer walls are four planes, the cheapest shape to collide with, and solids are boxes.
+"""
+
+import dataclasses
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+ANT_QPOS, ANT_QVEL = 15, 14  # the ant's share of qpos and qvel; a block's follows
+SOLID_HEIGHT = 4.0  # m
+TOLERANCE = 0.05  # m, by which a block may overrun its soft limits
+
+# Bits for contype and conaffinity: which pairs may collide. The ant meets everything but itself. A block meets
+# the solids named by its arena; everywhere else its joint limits hold it, and contacts would make it jam.
+_ANT, _BLOCK = 1, 2
+
+_GROUND, _BODY, _WALL, _MOVABLE, _GOAL = (
+    (0.86, 0.86, 0.84, 1),
+    (0.95, 0.6, 0.1, 1),
+    (0.55, 0.6, 0.68, 1),
+    (0.82, 0.45, 0.3, 1),
+    (0.2, 0.7, 0.35, 1),
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Slide:
+    """One joint along which a block moves."""
+
+    axis: tuple[float, float, float]
+    limits: tuple[float, float]  # m
+    damping: float  # N s/m
+
+
+@dataclasses.dataclass(frozen=True)
+class Block:
+    """A box that the ant can push."""
+
+    centre: tuple[float, float, float]  # m
+    slides: tuple[Slide, ...]
+    meets: tuple[int, ...]  # solids it can touch
+    half: tuple[float, float, float] = (3.96, 3.96, 2.0)  # m; a block as wide as its corridor would jam
+    mass: float = 0.1  # kg; HIRO's 0.2 and 1 g went through walls at a steady push
+
+
+@dataclasses.dataclass(frozen=True)
+class Arena:
+    """A room, in m, with the ant's start at the origin of x and y."""
+
+    room: tuple[float, float, float, float]  # x_low, y_low, x_high, y_high
+    solids: tuple[tuple[float, float, float, float], ...]  # likewise
+    goal: tuple[float, ...]  # 2 coordinates, or 3 where height counts
+    ground: float = 0.0  # height of the ground on which the ant starts
+    block: Block | None = None
+
+
+MAZE = Arena(room=(-4.0, -4.0, 20.0, 20.0), solids=((-4.0, 4.0, 12.0, 12.0),), goal=(0.0, 16.0))
+PUSH = Arena(
+    room=(-12.0, -4.0, 12.0, 20.0),
+    solids=((4.0, -4.0, 12.0, 4.0), (-12.0, 12.0, -4.0, 20.0), (4.0, 12.0, 12.0, 20.0)),
+    goal=(0.0, 19.0),
+    block=Block(
+        centre=(0.0, 8.0, 2.0),
+        slides=(Slide((1.0, 0.0, 0.0), (-8.0, 8.0), 1.0), Slide((0.0, 1.0, 0.0), (-8.0, 8.0), 1.0)),
+        meets=(0, 1, 2),
+    ),
+)
+FALL = Arena(
+    room=(-4.0, -4.0, 12.0, 28.0),
+    solids=((-4.0, -4.0, 12.0, 12.0), (-4.0, 20.0, 12.0, 28.0)),  # platforms before and behind a chasm 4 m deep
+    goal=(0.0, 27.0, 4.5),
+    ground=4.0,
+    block=Block(
+        centre=(8.0, 8.0, 6.0),
+        # It may rise a little: a limit at 0 would press it against the platform. Its fall is not damped.
+        slides=(Slide((0.0, 1.0, 0.0), (-8.0, 8.0), 1.0), Slide((0.0, 0.0, 1.0), (-4.0, 0.1), 0.0)),
+        meets=(0,),
+    ),
+)
+
+
+def furnish(spec: mujoco.MjSpec, arena: Arena) -> None:
+    """Put the ant of `spec` into the arena; all its 13 body geoms collide with floor, walls, solids and block.
+
+    An ant that never ends an episode can lie on its back, where feet alone would let it sink into the floor.
+    The floor is met by the same shapes as in `ant`: its foot spheres are the ends of the ankles' capsules.
+    """
+    for geom in spec.geoms:
+        if geom.name == "floor":
+            geom.conaffinity = _ANT
+            geom.material, geom.rgba = "", _GROUND
+        else:
+            is_foot = geom.type == mujoco.mjtGeom.mjGEOM_SPHERE and geom.name != "torso_geom"
+            geom.contype, geom.conaffinity = (0, 0) if is_foot else (_ANT, 0)
+            geom.rgba = _BODY  # to be seen from above
+    _add_walls(spec, arena)
+    for i, solid in enumerate(arena.solids):
+        meets = _ANT | (_BLOCK if arena.block and i in arena.block.meets else 0)
+        _add_box(spec.worldbody, f"solid_{i}", solid, meets)
+    if arena.block:
+        _add_block(spec, arena.block)
+    goal = (*arena.goal, arena.ground + 0.5)[:3]
+    spec.worldbody.add_site(name="goal", pos=goal, size=[0.5] * 3, rgba=_GOAL)
+    spec.body("torso").pos[2] += arena.ground
+    _add_camera(spec, arena)
+
+
+def outside(arena: Arena, qpos: Float[np.ndarray, "*batch nq"]) -> int:
+    """Count the states in which the torso is out of the room or in a solid, or the block beyond its limits."""
+    x, y, z = np.moveaxis(qpos[..., :3], -1, 0)
+    x_low, y_low, x_high, y_high = arena.room
+    wrong = (x < x_low) | (x > x_high) | (y < y_low) | (y > y_high) | (z < 0)
+    for a, b, c, d in arena.solids:
+        wrong |= (x > a) & (x < c) & (y > b) & (y < d) & (z < SOLID_HEIGHT)
+    for i, slide in enumerate(arena.block.slides if arena.block else ()):
+        low, high = slide.limits
+        wrong |= (qpos[..., ANT_QPOS + i] < low - TOLERANCE) | (qpos[..., ANT_QPOS + i] > high + TOLERANCE)
+    return int(wrong.sum())
+
+
+def _add_walls(spec: mujoco.MjSpec, arena: Arena) -> None:
+    x_low, y_low, x_high, y_high = arena.room
+    x, y, height = (x_low + x_high) / 2, (y_low + y_high) / 2, arena.ground + SOLID_HEIGHT
+    for name, pos, inward in (
+        ("west", (x_low, y), (1, 0)),
+        ("south", (x, y_low), (0, 1)),
+        ("east", (x_high, y), (-1, 0)),
+        ("north", (x, y_high), (0, -1)),
+    ):
+        half_length = (y_high - y_low if inward[0] else x_high - x_low) / 2
+        wall = spec.worldbody.add_geom(
+            name=name,
+            type=mujoco.mjtGeom.mjGEOM_PLANE,
+            pos=(*pos, height / 2),
+            size=(height / 2, half_length, 1),
+            rgba=_WALL,
+            contype=0,
+            conaffinity=_ANT,
+        )
+        # A plane's normal is its z axis; its x axis, the first of its sizes as drawn, points up.
+        wall.alt.type = mujoco.mjtOrientation.mjORIENTATION_XYAXES
+        wall.alt.xyaxes = (0, 0, 1, inward[1], -inward[0], 0)
+
+
+def _add_box(body: mujoco.MjsBody, name: str, rectangle: tuple[float, ...], conaffinity: int) -> None:
+    x_low, y_low, x_high, y_high = rectangle
+    body.add_geom(
+        name=name,
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        pos=((x_low + x_high) / 2, (y_low + y_high) / 2, SOLID_HEIGHT / 2),
+        size=((x_high - x_low) / 2, (y_high - y_low) / 2, SOLID_HEIGHT / 2),
+        rgba=_WALL,
+        contype=0,
+        conaffinity=conaffinity,
+    )
+
+
+def _add_block(spec: mujoco.MjSpec, block: Block) -> None:
+    body = spec.worldbody.add_body(name="block", pos=block.centre)
+    for i, slide in enumerate(block.slides):
+        body.add_joint(
+            name=f"block_{i}",
+            type=mujoco.mjtJoint.mjJNT_SLIDE,
+            axis=slide.axis,
+            limited=mujoco.mjtLimited.mjLIMITED_TRUE,
+            range=slide.limits,
+            damping=[slide.damping, 0, 0],
+            armature=0,
+        )
+    body.add_geom(
+        name="block",
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        size=block.half,
+        mass=block.mass,
+        rgba=_MOVABLE,
+        contype=_BLOCK,
+        conaffinity=_ANT,
+    )
+
+
+def _add_camera(spec: mujoco.MjSpec, arena: Arena) -> None:
+    """Look at the whole room from above, tilted a little so that heights show."""
+    x_low, y_low, x_high, y_high = arena.room
+    tilt, away = np.deg2rad(25), 1.35 * max(y_high - y_low, 0.8 * (x_high - x_low))
+    pos = ((x_low + x_high) / 2, (y_low + y_high) / 2 - away * np.sin(tilt), arena.ground + away * np.cos(tilt))
+    camera = spec.worldbody.add_camera(name="arena", pos=pos)
+    camera.alt.type = mujoco.mjtOrientation.mjORIENTATION_XYAXES
+    camera.alt.xyaxes = (1, 0, 0, 0, np.cos(tilt), np.sin(tilt))

@@ -1,0 +1,129 @@
+"""The contract of `Env`, held against an environment without compiling or running it."""
+
+import math
+import sys
+import traceback
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from taic_jax.envs.base import Env, State
+from taic_jax.envs.errors import ContractError
+from taic_jax.envs.wrappers import AutoReset, TimeLimit
+
+_SIZES = ("observation_size", "action_size", "proprioceptive_size", "episode_length")
+_METHODS = ("reset", "step", "render")
+
+
+def check_contract(env: Env) -> None:
+    """Refuse an environment that breaks the contract of `Env`, by abstract evaluation alone.
+
+    `TimeLimit` and `AutoReset` are looked through: what is checked is the environment inside.
+
+    Raises:
+      ContractError: the first breach; the message starts with the environment's name and the field.
+    """
+    outermost = env
+    while type(env) in (TimeLimit, AutoReset):
+        env = env.env  # pyright: ignore[reportAttributeAccessIssue]
+    _check_attributes(env)
+    _check_attributes(outermost)
+    key = jax.eval_shape(lambda: jax.random.key(0))
+    start = _trace(env, "reset", key)
+    after = _trace(env, "step", start, jax.ShapeDtypeStruct((env.action_size,), jnp.float32))
+    _check_same(env, start, "step", after)
+    if type(env).restart is not Env.restart:
+        _check_same(env, start, "restart", _trace(env, "restart", key, start.physics))
+
+
+def _check_attributes(env: Env) -> None:
+    name = getattr(env, "name", None)
+    if not isinstance(name, str) or not name:
+        raise ContractError(type(env).__name__, "name", f"got {name!r}, expected a string")
+    for field in (*_SIZES, "dt", *_METHODS):
+        if not hasattr(env, field):
+            raise ContractError(name, field, "is missing")
+    for field in _METHODS:
+        if not callable(getattr(env, field)):
+            raise ContractError(name, field, f"got {getattr(env, field)!r}, expected a method")
+    for field in _SIZES:
+        size = getattr(env, field)
+        if isinstance(size, bool) or not isinstance(size, (int, np.integer)) or size < 1:
+            raise ContractError(name, field, f"got {size!r}, expected an integer of at least 1")
+    if env.proprioceptive_size > env.observation_size:
+        raise ContractError(
+            name,
+            "proprioceptive_size",
+            f"got {env.proprioceptive_size}, expected at most observation_size, {env.observation_size}",
+        )
+    if isinstance(env.dt, bool) or not isinstance(env.dt, (int, float, np.number)) or not 0 < env.dt < math.inf:
+        raise ContractError(name, "dt", f"got {env.dt!r}, expected a positive number of seconds")
+
+
+def _trace(env: Env, method: str, *arguments: Any) -> State:
+    """Call a method on abstract arrays; what it raises is told with the line of the environment's own file."""
+    try:
+        state = jax.eval_shape(getattr(env, method), *arguments)
+    except Exception as error:
+        file = getattr(sys.modules.get(type(env).__module__), "__file__", None)
+        lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == file]
+        where = f" (line {lines[-1]} of {file})" if lines else ""
+        what = " ".join([f"{type(error).__name__}:", *str(error).partition("\n")[0].split()])
+        raise ContractError(env.name, method, f"cannot be traced by JAX: {what}{where}") from error
+    _check_state(env, method, state)
+    return state
+
+
+def _check_state(env: Env, method: str, state: Any) -> None:
+    """Hold what one method returns against the shapes and dtypes that `State` promises."""
+    if not isinstance(state, State):
+        raise ContractError(env.name, method, f"returns {type(state).__name__}, expected State")
+    if not isinstance(state.metrics, dict):
+        raise ContractError(env.name, "metrics", f"{method} returns {type(state.metrics).__name__}, expected dict")
+    expected = {
+        "obs": (state.obs, (env.observation_size,), jnp.float32),
+        "reward": (state.reward, (), jnp.float32),
+        "terminated": (state.terminated, (), jnp.bool_),
+        "truncated": (state.truncated, (), jnp.bool_),
+        **{f"metrics[{name!r}]": (value, (), jnp.float32) for name, value in state.metrics.items()},
+    }
+    for field, (value, shape, dtype) in expected.items():
+        promised = jax.ShapeDtypeStruct(shape, dtype)
+        if not isinstance(value, jax.ShapeDtypeStruct) or (value.shape, value.dtype) != (shape, promised.dtype):
+            raise ContractError(env.name, field, f"{method} returns {_show(value)}, expected {_show(promised)}")
+
+
+def _check_same(env: Env, start: State, method: str, after: State) -> None:
+    """Refuse a method that changes structure, shapes, dtypes or weak types of what reset made."""
+    if start.metrics.keys() != after.metrics.keys():
+        given, expected = _names(after.metrics), _names(start.metrics)
+        raise ContractError(env.name, "metrics", f"{method} returns {given}, reset returns {expected}")
+    for field in State.__dataclass_fields__:
+        made, kept = getattr(start, field), getattr(after, field)
+        old, new = _leaves(field, made), _leaves(field, kept)
+        for path in {**old, **new}:
+            given, expected = _show(new.get(path)), _show(old.get(path))
+            if given != expected:
+                raise ContractError(env.name, path, f"{method} returns {given}, reset returns {expected}")
+        if jax.tree.structure(made) != jax.tree.structure(kept):
+            raise ContractError(env.name, field, f"{method} returns another kind of tree than reset")
+
+
+def _leaves(field: str, tree: Any) -> dict[str, Any]:
+    return {field + jax.tree_util.keystr(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(tree)}
+
+
+def _names(metrics: dict[str, Any]) -> str:
+    return "{" + ", ".join(sorted(map(repr, metrics))) + "}"
+
+
+def _show(value: Any) -> str:
+    """Write an abstract array as float32[3], with what else decides whether a program compiles again."""
+    if value is None:
+        return "nothing"
+    if not isinstance(value, jax.ShapeDtypeStruct):
+        return type(value).__name__
+    weak = " (weakly typed)" if value.weak_type else ""
+    return f"{value.dtype}[{','.join(map(str, value.shape))}]{weak}"

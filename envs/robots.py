@@ -1,0 +1,124 @@
+"""The four running robots as data: which MJCF, and the constants of Gym's reward, start and end."""
+
+import dataclasses
+import importlib.util
+import math
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+from taic_jax.envs.errors import MissingExtraError
+
+
+@dataclasses.dataclass(frozen=True)
+class Robot:
+    """What a task takes from its body."""
+
+    mjcf: tuple[str, str]  # package that ships it, path in it
+    num_unobserved: int  # leading entries of qpos left out of obs: the place on the ground
+    control_cost: float  # weight of |action|^2
+    reset_noise: float  # half-width on qpos; see also velocity_noise
+    velocity_noise: str = "uniform"  # of half-width reset_noise, or normal of that standard deviation
+    substeps: int = 5  # engine steps a tick
+    healthy_reward: float = 0.0  # a tick
+    final_healthy_reward: bool = True  # also at the tick that ends unhealthy, as in Gym up to version 4
+    height_index: int = 1  # entry of qpos that holds the torso's height ...
+    root_height: float = 0.0  # m, ... above this
+    healthy_height: tuple[float, float] = (-math.inf, math.inf)  # m; outside it the episode ends
+    healthy_angle: float = math.inf  # rad, of a planar robot's pitch, qpos[2], to either side
+    healthy_state: float = math.inf  # for every entry of qpos and qvel behind the first two
+    velocity_limit: float = math.inf  # at which velocities are clipped in obs
+    start_in_default_pose: bool = False  # and not in the model's numeric `init_qpos`
+    # MJX's solver and line search; None for the model's own. Chosen by `experiments.worlds`.
+    iterations: int | None = None
+    ls_iterations: int | None = 4
+
+
+def _brax(name: str) -> tuple[str, str]:
+    return "brax", f"envs/assets/{name}.xml"
+
+
+def _gym(name: str) -> tuple[str, str]:
+    return "gymnasium", f"envs/mujoco/assets/{name}.xml"
+
+
+_HALF_CHEETAH = Robot(
+    _brax("half_cheetah"), num_unobserved=1, control_cost=0.1, reset_noise=0.1, velocity_noise="normal"
+)
+_ANT = Robot(
+    _brax("ant"),
+    num_unobserved=2,
+    control_cost=0.5,
+    reset_noise=0.1,
+    velocity_noise="normal",
+    healthy_reward=1.0,
+    healthy_height=(0.2, 1.0),
+    height_index=2,
+)
+# Brax moved the root joints of hopper and walker2d into the torso, where its height of 1.25 m reads 0.
+_HOPPER = Robot(
+    _brax("hopper"),
+    num_unobserved=1,
+    control_cost=1e-3,
+    reset_noise=5e-3,
+    substeps=4,
+    healthy_reward=1.0,
+    root_height=1.25,
+    healthy_height=(0.7, math.inf),
+    healthy_angle=0.2,
+    healthy_state=100.0,
+    velocity_limit=10.0,
+)
+_WALKER2D = dataclasses.replace(
+    _HOPPER,
+    mjcf=_brax("walker2d"),
+    healthy_height=(0.8, 2.0),
+    healthy_angle=1.0,
+    healthy_state=math.inf,
+)
+_GYM = {"root_height": 0.0, "final_healthy_reward": False, "start_in_default_pose": True}
+
+# By the config's `env.model`. `gym` is Gymnasium's own MJCF, integrator and rules of version 5, without the
+# ant's contact forces, which MJX does not compute and which cost at most 42 an episode.
+ROBOTS: dict[str, dict[str, Robot]] = {
+    "brax": {"half_cheetah": _HALF_CHEETAH, "ant": _ANT, "hopper": _HOPPER, "walker2d": _WALKER2D},
+    "gym": {
+        "half_cheetah": dataclasses.replace(_HALF_CHEETAH, mjcf=_gym("half_cheetah"), **_GYM),
+        "ant": dataclasses.replace(_ANT, mjcf=_gym("ant"), **_GYM),
+        "hopper": dataclasses.replace(_HOPPER, mjcf=_gym("hopper"), **_GYM),
+        "walker2d": dataclasses.replace(_WALKER2D, mjcf=_gym("walker2d_v5"), **_GYM),
+    },
+}
+
+
+def load_spec(robot: Robot) -> mujoco.MjSpec:
+    """Read the robot's MJCF from the package that ships it, found without importing that (which is slow).
+
+    Raises:
+      MissingExtraError: the package is not installed.
+    """
+    package, path = robot.mjcf
+    found = importlib.util.find_spec(package)
+    if found is None or found.origin is None:
+        raise MissingExtraError(package, "gym" if package == "gymnasium" else None)
+    return mujoco.MjSpec.from_file(str(Path(found.origin).parent / path))
+
+
+def compile_spec(spec: mujoco.MjSpec) -> mujoco.MjModel:
+    """Compile a model; the attribute `settotalmass`, deprecated with a warning, is replaced as MuJoCo asks."""
+    total_mass, spec.compiler.settotalmass = spec.compiler.settotalmass, -1
+    model = spec.compile()
+    if total_mass > 0:
+        mujoco.mj_setTotalmass(model, total_mass)
+        mujoco.mj_setConst(model, mujoco.MjData(model))
+    return model
+
+
+def initial_qpos(robot: Robot, model: mujoco.MjModel) -> Float[np.ndarray, " nq"]:
+    """Return the pose that the model's custom numeric `init_qpos` holds, else its default pose."""
+    index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, "init_qpos")
+    if index < 0 or robot.start_in_default_pose:
+        return model.qpos0
+    return model.numeric("init_qpos").data

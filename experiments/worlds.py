@@ -1,0 +1,185 @@
+"""Measure every task on every backend beside the bare engine, and MJX's solver settings.
+
+python -m taic_jax.experiments.worlds --json worlds.json
+python -m taic_jax.experiments.worlds --solver --tasks ant ant_push
+"""
+
+import dataclasses
+import json
+import statistics
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+
+from taic_jax import envs
+from taic_jax.envs.physics.mjx import MjxPhysics
+from taic_jax.envs.physics.mujoco import MujocoPhysics
+from taic_jax.envs.third_party import third_party
+from taic_jax.experiments.throughput import engine
+
+ROUNDS = 3
+SETTINGS = ((1, 4), (2, 4), (4, 4), (4, 8), (4, 50), (8, 8))  # iterations, ls_iterations
+
+
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+    """Print the table of all tasks and backends, or of MJX's solver settings."""
+
+    tasks: tuple[str, ...] = ()
+    """Tasks to measure; by default all."""
+    backends: tuple[str, ...] = ("mujoco", "mjx")
+    """Backends to measure."""
+    num_envs: int = 1024
+    """Environments on mujoco."""
+    num_envs_mjx: int = 64
+    """Environments on mjx."""
+    length: int = 64
+    """Ticks per environment and measurement on mujoco; mjx makes a quarter of them."""
+    solver: bool = False
+    """Measure MJX's solver settings instead: speed, and error of a tick against the C engine."""
+    json: Path | None = None
+    """Also write the table to this file."""
+
+
+def ours(env: envs.Env, num_envs: int, length: int) -> Callable[[], Any]:
+    """Return the task's compiled loop with time limit and automatic reset, under random actions."""
+    env = envs.AutoReset(env)
+    state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), num_envs))
+    actions = _random_actions(env, num_envs, length)
+    step = jax.vmap(env.step)
+
+    def run(state: envs.State) -> envs.State:
+        return jax.lax.scan(lambda state, action: (step(state, action), state.reward), state, actions)[0]
+
+    compiled = jax.jit(run)
+    return lambda: jax.block_until_ready(compiled(state))
+
+
+def plain_mjx(env: envs.Env, num_envs: int, length: int) -> Callable[[], Any]:
+    """Return a compiled loop of `mjx.step` with the same model and settings, that keeps the whole `mjx.Data`."""
+    with third_party():
+        from mujoco import mjx
+    data = jax.tree.map(lambda x: jnp.broadcast_to(x, (num_envs, *jnp.shape(x))), env.physics._data)
+    actions = jnp.repeat(_random_actions(env, num_envs, length), env.physics.substeps, axis=0)
+
+    def run(data: Any) -> Any:
+        with third_party():
+            step = jax.vmap(lambda data, ctrl: mjx.step(env.physics._model, data.replace(ctrl=ctrl)))
+            return jax.lax.scan(lambda data, ctrl: (step(data, ctrl), None), data, actions)[0]
+
+    compiled = jax.jit(run)
+    return lambda: jax.block_until_ready(compiled(data))
+
+
+def _random_actions(env: envs.Env, num_envs: int, length: int) -> jax.Array:
+    return jax.random.uniform(jax.random.key(1), (length, num_envs, env.action_size), minval=-1.0)
+
+
+def speeds(loops: list[Callable[[], Any]], ticks: int) -> list[list[float]]:
+    """Return ticks per second of each loop in each round; the loops take turns."""
+    result: list[list[float]] = [[] for _ in loops]
+    for loop in loops:
+        loop()  # compile and warm up
+    for _ in range(ROUNDS):
+        for loop, values in zip(loops, result, strict=True):
+            begun = time.perf_counter()
+            loop()
+            values.append(ticks / (time.perf_counter() - begun))
+    return result
+
+
+def measure(arguments: Arguments, task: str, backend: str) -> dict[str, Any]:
+    """Return one row: sizes, possible contacts, ticks per second, and the ratio to the bare engine."""
+    env = envs.make_env(task, backend)
+    num_envs, length = arguments.num_envs, arguments.length
+    if backend != "mujoco":
+        num_envs, length = arguments.num_envs_mjx, arguments.length // 4
+    row = {"task": task, "backend": backend, "obs": env.observation_size, "act": env.action_size, "envs": num_envs}
+    loops = [ours(env, num_envs, length)]
+    if hasattr(env.env, "physics"):
+        row["contacts"] = possible_contacts(env)
+        loops.append((engine if backend == "mujoco" else plain_mjx)(env, num_envs, length))
+    values = speeds(loops, num_envs * length)
+    row["ticks_per_second"] = statistics.median(values[0])
+    if len(values) > 1:
+        row["bare"] = statistics.median(values[1])
+        row["ratio"] = statistics.median(np.divide(*values))
+    return row
+
+
+def possible_contacts(env: envs.Env) -> int:
+    """Count the contacts that MJX computes at every engine step."""
+    with third_party():
+        from mujoco import mjx
+
+        return mjx.make_data(env.model, impl="jax")._impl.contact.dist.shape[0]
+
+
+def measure_solver(task: str, num_envs: int, length: int) -> Iterator[dict[str, Any]]:
+    """Yield one row per setting: speed, and the error in qvel of a tick from states with contacts."""
+    env = envs.make_env(task, "mujoco")
+    exact = env.physics
+    state = _moving_states(env, exact, num_envs)
+    ctrl = _random_actions(env, num_envs, 1)[0]
+    expected = jax.vmap(exact.step)(state, ctrl)
+    for iterations, ls_iterations in SETTINGS:
+        physics = MjxPhysics(env.model, env.physics.substeps, iterations, ls_iterations)
+        step = jax.jit(jax.vmap(physics.step))
+        error = jnp.abs(step(state, ctrl).qvel - expected.qvel).max(axis=1)
+        loop = jax.jit(lambda state, step=step: jax.lax.fori_loop(0, length, lambda _, s: step(s, ctrl), state))
+        (values,) = speeds([lambda loop=loop: jax.block_until_ready(loop(state))], num_envs * length)
+        yield {
+            "task": task, "iterations": iterations, "ls_iterations": ls_iterations,
+            "ticks_per_second": statistics.median(values),
+            "median_error": float(jnp.median(error)), "worst_error": float(jnp.max(error)),
+        }  # fmt: skip
+
+
+def _moving_states(env: envs.Env, physics: MujocoPhysics, num_envs: int) -> envs.PhysicsState:
+    """Return states after 50 ticks of random actions."""
+    state = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), num_envs)).physics
+    actions = _random_actions(env, num_envs, 50)
+    return jax.jit(lambda s: jax.lax.scan(lambda s, a: (jax.vmap(physics.step)(s, a), None), s, actions)[0])(state)
+
+
+def show(row: dict[str, Any]) -> None:
+    """Print one row."""
+    print(
+        "  ".join(
+            f"{name} {value:,.4g}"
+            if isinstance(value, float)
+            else f"{value!s:>10}"
+            if name == "task"
+            else f"{name} {value}"
+            for name, value in row.items()
+        ),
+        flush=True,
+    )
+
+
+def main() -> None:
+    """Print the table."""
+    arguments = tyro.cli(Arguments)
+    tasks = arguments.tasks or envs.environment_names()
+    rows = []
+    for task in tasks:
+        if arguments.solver:
+            found = measure_solver(task, arguments.num_envs_mjx, arguments.length // 4)
+        else:
+            engines = arguments.backends if hasattr(envs.make_env(task).env, "physics") else ("auto",)
+            found = (measure(arguments, task, backend) for backend in engines)
+        for row in found:
+            show(row)
+            rows.append(row)
+    if arguments.json:
+        arguments.json.write_text(json.dumps(rows, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()
