@@ -1,7 +1,8 @@
-"""Measure every task on every backend beside the bare engine, and MJX's solver settings.
+"""Measure every task on every backend beside the bare engine; MJX's solver settings; ants let loose.
 
 python -m taic_jax.experiments.worlds --json worlds.json
 python -m taic_jax.experiments.worlds --solver --tasks ant ant_push
+python -m taic_jax.experiments.worlds --soak --length 1000
 """
 
 import dataclasses
@@ -14,16 +15,18 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco.batch
 import numpy as np
 import tyro
 
 from taic_jax import envs
+from taic_jax.envs.arenas import outside
 from taic_jax.envs.physics.mjx import MjxPhysics
 from taic_jax.envs.physics.mujoco import MujocoPhysics
 from taic_jax.envs.third_party import third_party
-from taic_jax.experiments.throughput import engine
 
-ROUNDS = 3
+ROUNDS = 7
+ARENAS = ("ant_maze", "ant_push", "ant_fall")
 SETTINGS = ((1, 4), (2, 4), (4, 4), (4, 8), (4, 50), (8, 8))  # iterations, ls_iterations
 
 
@@ -43,6 +46,8 @@ class Arguments:
     """Ticks per environment and measurement on mujoco; mjx makes a quarter of them."""
     solver: bool = False
     """Measure MJX's solver settings instead: speed, and error of a tick against the C engine."""
+    soak: bool = False
+    """Let random ants loose in the arenas instead, and count those that leave them."""
     json: Path | None = None
     """Also write the table to this file."""
 
@@ -59,6 +64,32 @@ def ours(env: envs.Env, num_envs: int, length: int) -> Callable[[], Any]:
 
     compiled = jax.jit(run)
     return lambda: jax.block_until_ready(compiled(state))
+
+
+def bare_engine(env: envs.Env, num_envs: int, length: int) -> Callable[[], Any]:
+    """Return a loop over `mujoco.batch` from NumPy that steps the very states which `ours` steps.
+
+    They are set at each tick: alone, robots that nothing resets soon lie on the ground or fall through it,
+    which costs the engine more or less than what it is compared with.
+    """
+    wrapped = envs.AutoReset(env)
+    actions, step = _random_actions(env, num_envs, length), jax.vmap(wrapped.step)
+
+    def tick(state: envs.State, action: jax.Array) -> tuple[envs.State, jax.Array]:
+        sent = [state.physics.qpos, state.physics.qvel, state.physics.qacc_warmstart, action]
+        return step(state, action), jnp.concatenate(sent, axis=1)
+
+    start = jax.jit(jax.vmap(wrapped.reset))(jax.random.split(jax.random.key(0), num_envs))
+    states = np.asarray(jax.jit(lambda state: jax.lax.scan(tick, state, actions)[1])(start), np.float64)
+    batch = mujoco.batch.Batch(env.model, num_envs, env.physics.num_threads)
+    rows = batch.state[:, 1 : 1 + states.shape[2]]  # behind the time
+
+    def run() -> None:
+        for row in states:
+            rows[...] = row
+            batch.step(nstep=env.physics.substeps)
+
+    return run
 
 
 def plain_mjx(env: envs.Env, num_envs: int, length: int) -> Callable[[], Any]:
@@ -98,19 +129,38 @@ def measure(arguments: Arguments, task: str, backend: str) -> dict[str, Any]:
     """Return one row: sizes, possible contacts, ticks per second, and the ratio to the bare engine."""
     env = envs.make_env(task, backend)
     num_envs, length = arguments.num_envs, arguments.length
-    if backend != "mujoco":
+    if backend in ("mjx", "warp"):
         num_envs, length = arguments.num_envs_mjx, arguments.length // 4
     row = {"task": task, "backend": backend, "obs": env.observation_size, "act": env.action_size, "envs": num_envs}
     loops = [ours(env, num_envs, length)]
     if hasattr(env.env, "physics"):
         row["contacts"] = possible_contacts(env)
-        loops.append((engine if backend == "mujoco" else plain_mjx)(env, num_envs, length))
+        loops.append((bare_engine if backend == "mujoco" else plain_mjx)(env, num_envs, length))
     values = speeds(loops, num_envs * length)
     row["ticks_per_second"] = statistics.median(values[0])
     if len(values) > 1:
         row["bare"] = statistics.median(values[1])
         row["ratio"] = statistics.median(np.divide(*values))
     return row
+
+
+def soak(arguments: Arguments, task: str, backend: str) -> dict[str, Any]:
+    """Return how many states of `num_envs_mjx` ants in `length` ticks are outside their arena or not finite."""
+    env = envs.AutoReset(envs.make_env(task, backend))
+    num_envs = arguments.num_envs_mjx
+    state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), num_envs))
+    actions = _random_actions(env, num_envs, arguments.length)
+    step = jax.vmap(env.step)
+
+    def tick(state: envs.State, action: jax.Array) -> tuple[envs.State, jax.Array]:
+        state = step(state, action)
+        return state, state.physics.qpos
+
+    qpos = np.asarray(jax.jit(lambda state: jax.lax.scan(tick, state, actions)[1])(state))
+    return {
+        "task": task, "backend": backend, "states": num_envs * arguments.length,
+        "outside": outside(env.arena, qpos), "nan": int(np.isnan(qpos).sum()),
+    }  # fmt: skip
 
 
 def possible_contacts(env: envs.Env) -> int:
@@ -150,15 +200,11 @@ def _moving_states(env: envs.Env, physics: MujocoPhysics, num_envs: int) -> envs
 
 def show(row: dict[str, Any]) -> None:
     """Print one row."""
+    texts = [f"{value:,.4g}" if isinstance(value, float) else str(value) for value in row.values()]
     print(
-        "  ".join(
-            f"{name} {value:,.4g}"
-            if isinstance(value, float)
-            else f"{value!s:>10}"
-            if name == "task"
-            else f"{name} {value}"
-            for name, value in row.items()
-        ),
+        f"{texts[0]:12}",
+        *(f"{name} {text}" for name, text in zip(list(row)[1:], texts[1:], strict=True)),
+        sep="  ",
         flush=True,
     )
 
@@ -166,14 +212,15 @@ def show(row: dict[str, Any]) -> None:
 def main() -> None:
     """Print the table."""
     arguments = tyro.cli(Arguments)
-    tasks = arguments.tasks or envs.environment_names()
+    tasks = arguments.tasks or (ARENAS if arguments.soak else envs.environment_names())
     rows = []
     for task in tasks:
         if arguments.solver:
             found = measure_solver(task, arguments.num_envs_mjx, arguments.length // 4)
         else:
             engines = arguments.backends if hasattr(envs.make_env(task).env, "physics") else ("auto",)
-            found = (measure(arguments, task, backend) for backend in engines)
+            row_of = soak if arguments.soak else measure
+            found = (row_of(arguments, task, backend) for backend in engines)
         for row in found:
             show(row)
             rows.append(row)

@@ -95,7 +95,7 @@ def run_pipeline(config: Config, run_dir: Path, *, resume: bool = False, overwri
       ConfigError: the config does not fit the environment.
     """
     env, source = make_envs(config)
-    _prepare(config, run_dir, resume, overwrite)
+    prepare_folder(config, run_dir, resume=resume, overwrite=overwrite)
     # Seed k of a run is seed 0 of a run whose seed is k more.
     keys = jnp.stack([jax.random.key(config.seed + k) for k in range(config.seeds)])
     with RunLogger(run_dir) as logger:
@@ -142,8 +142,12 @@ def make_envs(config: Config) -> tuple[Env, Env]:
     return env, source
 
 
-def _prepare(config: Config, run_dir: Path, resume: bool, overwrite: bool) -> None:
-    """Make the run folder, or check that it is the one to resume."""
+def prepare_folder(config: Config, run_dir: Path, *, resume: bool = False, overwrite: bool = False) -> None:
+    """Make the run folder, or check that it is the one to resume.
+
+    Raises:
+      RunFolderError: the folder holds another run, or none where one is to be resumed.
+    """
     saved, text = run_dir / "config.yaml", to_yaml(config)
     if resume:
         if not saved.is_file():

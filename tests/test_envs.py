@@ -1,6 +1,7 @@
 """The contract of tasks and wrappers, held by every environment that has a name."""
 
 import functools
+import importlib.util
 import subprocess
 import sys
 from pathlib import Path
@@ -12,6 +13,8 @@ import pytest
 
 from taic_jax import envs
 from taic_jax.envs import AutoReset, Env, State, TimeLimit, make_env
+from taic_jax.envs.errors import BackendError
+from taic_jax.envs.physics import mjx
 
 SEEDS, ENVS, TICKS, LIMIT = 2, 3, 100, 30
 
@@ -195,6 +198,8 @@ def test_auto_reset_is_the_same_under_vmap_and_alone():
         ({"name": "half_cheeta"}, "unknown environment 'half_cheeta': did you mean 'half_cheetah'?"),
         ({"name": "brax:reecher"}, "unknown environment 'brax:reecher': did you mean 'brax:reacher'?"),
         ({"name": "ant", "backend": "mujocco"}, "unknown backend 'mujocco': did you mean 'mujoco'?"),
+        ({"name": "nav2d", "backend": "mjxx"}, "unknown backend 'mjxx': did you mean 'mjx'?"),
+        ({"name": "hopper", "model": "gymn"}, "unknown model 'gymn': did you mean 'gym'?"),
         ({"name": "brax:ant", "pipeline": "sprint"}, "unknown pipeline 'sprint': did you mean 'spring'?"),
     ],
 )
@@ -202,6 +207,57 @@ def test_a_wrong_name_gets_one_line_with_the_nearest(given, hint):
     with pytest.raises(envs.UnknownNameError) as error:
         make_env(**given)
     assert str(error.value).startswith(hint) and "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("given", "says"),
+    [
+        (
+            {"name": "nav2d", "model": "gym"},
+            "env.model: nav2d has no such option, got 'gym'; its options: change_after",
+        ),
+        (
+            {"name": "ant_push", "goal": "uniform"},
+            "env.goal: ant_push has no such option, got 'uniform'; its options: body",
+        ),
+        ({"name": "ant_turn", "body": "hiro"}, "env.body: ant_turn has no such option, got 'hiro'; its options: none"),
+    ],
+)
+def test_an_option_of_another_task_is_refused(given, says):
+    with pytest.raises(envs.EnvOptionError) as error:
+        make_env(**given)
+    assert str(error.value) == says
+    assert set(given) - {"name"} <= {"model", "goal", "body"} - set(envs.environment_options(given["name"]))
+
+
+def test_warp_says_what_it_needs(monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(envs.MissingExtraError, match=r"pip install 'taic-jax\[warp\]'"):
+        mjx._require_warp()
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: name)
+    with pytest.raises(BackendError, match=r"env.backend: warp needs an NVIDIA GPU, and JAX runs on cpu; .* mjx$"):
+        mjx._require_warp()
+    with pytest.raises(BackendError):
+        make_env("ant", "warp")
+
+
+def test_gyms_models_need_gymnasium(monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(envs.MissingExtraError, match=r"gymnasium is not installed: pip install 'taic-jax\[gym\]'"):
+        make_env("hopper", model="gym")
+
+
+class Lazy(Clock):
+    """A task that sets `terminated` and `truncated` only when it ends; `TimeLimit` clears them before."""
+
+    def step(self, state, action):
+        after = super().step(state, action)
+        return after.replace(terminated=state.terminated | after.terminated, truncated=state.truncated)
+
+
+def test_an_end_does_not_last_into_the_next_episode():
+    states = run(AutoReset(TimeLimit(Lazy(99), 3)), 7)
+    assert [bool(state.truncated) for state in states] == [False, False, False, True, False, False, True, False]
 
 
 def test_the_folder_cannot_be_imported_under_its_own_name():

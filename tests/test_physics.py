@@ -133,11 +133,13 @@ def test_a_model_with_more_state_is_refused():
         MujocoPhysics(mujoco.MjModel.from_xml_string(xml), 1)
 
 
-@pytest.mark.parametrize("name", [pytest.param("half_cheetah", marks=pytest.mark.slow), "ant"])
+@pytest.mark.parametrize(
+    "name", ["ant", *(pytest.param(n, marks=pytest.mark.slow) for n in ("half_cheetah", "hopper", "walker2d"))]
+)
 def test_mjx_agrees_with_the_engine(name):
     """In the air for 20 ticks, in contact for one; MJX computes in single precision."""
     env = make_env(name, "mjx").env
-    engine = jax.jit(jax.vmap(MujocoPhysics(env.model, 5).step))
+    engine = jax.jit(jax.vmap(MujocoPhysics(env.model, env.physics.substeps).step))
     step = jax.jit(jax.vmap(env.physics.step))
 
     height = env.robot.height_index
