@@ -19,7 +19,7 @@ TOLERANCE = 0.05  # m, by which a block may overrun its soft limits
 _ANT, _BLOCK = 1, 2
 
 _GROUND, _BODY, _WALL, _MOVABLE, _GOAL = (
-    (0.86, 0.86, 0.84, 1),
+    (0.5, 0.52, 0.5, 1),
     (0.95, 0.6, 0.1, 1),
     (0.55, 0.6, 0.68, 1),
     (0.82, 0.45, 0.3, 1),

@@ -39,7 +39,7 @@ PPO = {
     "half_cheetah": PPOConfig(learning_rate=6e-4),
     "hopper": _WALKING,
     "walker2d": _WALKING,
-    "ant": PPOConfig(learning_rate=6e-4),
+    "ant": PPOConfig(rollout_length=256, learning_rate=6e-4),
 }
 
 FIELDS = (

@@ -1,11 +1,16 @@
 """Strict modes for every test: no silent promotion of dtypes or ranks."""
 
+import ctypes.util
 import os
 from collections.abc import Callable
 
 import beartype
 import hypothesis
 import jax
+
+# A test may import MuJoCo before the package does, which would choose how to draw without a display.
+if "DISPLAY" not in os.environ:
+    os.environ.setdefault("MUJOCO_GL", "egl" if ctypes.util.find_library("EGL") else "glfw")
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")

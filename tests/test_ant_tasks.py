@@ -195,7 +195,11 @@ def test_possible_contacts_stay_few_and_are_all_between_the_right_bodies(name, m
 
 
 def driven(name: str, backend: str, torso: tuple, velocity: tuple, ticks: int):
-    """Return the path of qpos [ticks, nq] of an ant that is driven: its legs hang, its torso gets that speed."""
+    """Return the path of qpos [ticks, nq] of an ant that is driven: its legs hang, its torso gets that speed.
+
+    At the block's stop it lets go, as a walking ant does at each stride: pressed against the stop, a block of
+    0.1 kg hangs there by friction alone.
+    """
     env = make_env(name, backend)
     state = env.reset(jax.random.key(0))
     physics = state.physics
@@ -203,7 +207,8 @@ def driven(name: str, backend: str, torso: tuple, velocity: tuple, ticks: int):
     state = state.replace(physics=physics.replace(qpos=qpos, qvel=jnp.zeros_like(physics.qvel)))
 
     def tick(state, _):
-        qvel = state.physics.qvel.at[:2].set(jnp.array(velocity)).at[3:6].set(0.0)
+        speed = jnp.where(state.physics.qpos[15] < 7.97, jnp.array(velocity), -0.1 * jnp.array(velocity))
+        qvel = state.physics.qvel.at[:2].set(speed).at[3:6].set(0.0)
         state = env.step(state.replace(physics=state.physics.replace(qvel=qvel)), jnp.zeros(8))
         return state, state.physics.qpos
 

@@ -19,9 +19,9 @@ def near(frame, colour: str):
 
 
 def test_room_shows_point_walls_and_path():
-    env = Navigation()
+    env = Navigation(change_after=1)
     position = jnp.array([[1.0, 5.0], [1.2, 5.0], [1.4, 5.0], [8.0, 2.0]])  # the last is a reset
-    physics = NavigationState(position, jnp.broadcast_to(jnp.array([9.0, 5.0]), (4, 2)))
+    physics = NavigationState(position, jnp.broadcast_to(jnp.array([9.0, 5.0]), (4, 2)), jnp.array([0, 0, 0, 1]))
     frames = env.render(physics, height=200, width=300)
     assert frames.shape == (4, 200, 300, 3) and frames.dtype == np.uint8
 
@@ -31,13 +31,14 @@ def test_room_shows_point_walls_and_path():
     for t in range(4):
         assert near(frames[t], _WALL)[pixel(5.0, 2.0)] and near(frames[t], _WALL)[pixel(2.5, 3.0)]
         assert near(frames[t], _POINT)[pixel(*position[t].tolist())]
+        assert near(frames[t], _WALL)[pixel(7.2, 4.0)] == (t == 3), "the trap stands from the second episode on"
     red = near(frames, _POINT).sum(axis=(1, 2))
     assert red[0] < red[2] and red[3] <= red[0] + 2, "the path grows, and starts anew after a reset"
     assert not near(frames[0], _GOAL)[pixel(9.0, 5.7)]
     assert frames[0][pixel(9.0, 5.0)][1] > frames[0][pixel(9.0, 5.0)][0] + 30, "the goal is green"
 
 
-@pytest.mark.parametrize("name", ["half_cheetah", "ant"])
+@pytest.mark.parametrize("name", ["half_cheetah", "ant", "ant_push"])
 def test_robots_move_in_their_pictures(name):
     env = make_env(name, "mujoco")
     physics = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 2)).physics
