@@ -1,7 +1,6 @@
 """What the paper's options are carried to: an ant that turns, and ants in a maze, before a block and a chasm."""
 
 import dataclasses
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -96,8 +95,9 @@ class AntArena(Locomotion):
         if self.uniform_goal:
             low, high = jnp.array(self.arena.room).reshape(2, 2)
             goal = jax.random.uniform(key_goal, (2,), minval=low, maxval=high)
-            state = state.replace(physics=self._begin(state.physics.replace(goal=goal)))
-            state = state.replace(obs=self._observe(state.physics))
+            physics = state.physics.replace(goal=goal)
+            physics = physics.replace(closest=self._distance(physics))
+            state = state.replace(physics=physics, obs=self._observe(physics))
         return state
 
     def step(self, state: State, action: Float[Array, " A"]) -> State:
@@ -130,13 +130,12 @@ class AntArena(Locomotion):
             qpos[2] += self.arena.ground
         return qpos
 
-    def _begin(self, physics: Any) -> ArenaState:
+    def _begin(self, physics: PhysicsState) -> ArenaState:
         """Take the noise from the block, and start the record of distances."""
-        start, goal = self._init_qpos, getattr(physics, "goal", jnp.array(self.arena.goal, jnp.float32))
-        qpos = jnp.concatenate([physics.qpos[:ANT_QPOS], start[ANT_QPOS:]])
+        qpos = jnp.concatenate([physics.qpos[:ANT_QPOS], self._init_qpos[ANT_QPOS:]])
         qvel = physics.qvel.at[ANT_QVEL:].set(0.0)
-        closest = jnp.linalg.norm(goal - qpos[: goal.shape[0]])
-        return ArenaState(qpos, qvel, physics.qacc_warmstart, goal=goal, closest=closest)
+        start = ArenaState(qpos, qvel, physics.qacc_warmstart, goal=jnp.array(self.arena.goal), closest=jnp.zeros(()))
+        return start.replace(closest=self._distance(start))
 
     def _advance(self, before: ArenaState, after: ArenaState) -> ArenaState:
         return after.replace(closest=jnp.minimum(before.closest, self._distance(after)))
@@ -161,7 +160,9 @@ class AntArena(Locomotion):
     def _is_healthy(self, physics: PhysicsState) -> Bool[Array, ""]:
         return jnp.ones((), bool)
 
-    def _judge(self, before: Any, after: Any, action: Float[Array, " A"]) -> tuple[Float[Array, ""], dict[str, Array]]:
+    def _judge(
+        self, before: ArenaState, after: ArenaState, action: Float[Array, " A"]
+    ) -> tuple[Float[Array, ""], dict[str, Array]]:
         distance = self._distance(after)
         _, x, y, _ = after.qpos[3:7]
         metrics = {
