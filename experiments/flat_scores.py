@@ -89,7 +89,7 @@ def score(arguments: Arguments, task: str) -> dict[str, str]:
     cleanrl, tianshou = PUBLISHED[task]
     values = (
         task, arguments.ticks, arguments.seeds, returns.mean(), iqm(returns), low, high,
-        np.mean(last["return_mean_option"]["return"]), cleanrl, tianshou, run.clock.run,
+        float(np.mean(last["return_mean_option"]["return"])), cleanrl, tianshou, run.clock.run,
     )  # fmt: skip
     numbers = [f"{value:.0f}" if isinstance(value, float) else str(value) for value in values]
     return dict(zip(FIELDS, [*numbers, str(commit()), " ".join(f"{x:.0f}" for x in returns)], strict=True))
