@@ -31,7 +31,7 @@ class Robot:
     healthy_state: float = math.inf  # for every entry of qpos and qvel behind the first two
     velocity_limit: float = math.inf  # at which velocities are clipped in obs
     start_in_default_pose: bool = False  # and not in the model's numeric `init_qpos`
-    # MJX's solver and line search; None for the model's own. Chosen by `experiments.worlds`.
+    # MJX's solver and line search; None for the model's own. `experiments.worlds --solver` measures them.
     iterations: int | None = None
     ls_iterations: int | None = 4
 

@@ -16,8 +16,8 @@ with third_party():
     from mujoco import mjx
 
 
-# Warp keeps the contacts of all simulations of a call in one pool, and constraint rows by simulation. An ant on
-# its back in a corner, before the block, has 20 contacts of 4 rows each; 8192 simulations have room on average.
+# Warp keeps the contacts of all simulations of a call in one pool, and constraint rows by simulation.
+# Both sizes are estimates for 8192 simulations, not yet tried on a GPU.
 _WARP_CAPACITY = {"naconmax": 32 * 8192, "njmax": 200}
 
 
