@@ -13,7 +13,7 @@ from taic_jax.envs.arenas import ANT_QPOS, ANT_QVEL, Arena, furnish
 from taic_jax.envs.base import PhysicsState, State
 from taic_jax.envs.errors import UnknownNameError
 from taic_jax.envs.locomotion import Locomotion
-from taic_jax.envs.robots import ROBOTS, compile_spec, initial_qpos, load_spec
+from taic_jax.envs.robots import ROBOTS, Robot, compile_spec, initial_qpos, load_spec
 
 SUCCESS_RADIUS = 5.0  # m, of HIRO
 
@@ -26,6 +26,10 @@ class TurningState(PhysicsState):
 
 class AntTurn(Locomotion):
     """Turn left: the reward of `ant` with the yaw rate in rad/s in place of the forward speed."""
+
+    def __init__(self, name: str, robot: Robot, backend: str = "auto", num_threads: int = 0):
+        super().__init__(name, robot, backend, num_threads)
+        self.proprioception = "ant"
 
     def _begin(self, physics: PhysicsState) -> TurningState:
         return TurningState(physics.qpos, physics.qvel, physics.qacc_warmstart, turns=jnp.zeros(()))
@@ -87,6 +91,7 @@ class AntArena(Locomotion):
         self.episode_length = 500 if body == "hiro" else 1000
         super().__init__(name, robot, backend, num_threads)
         self.proprioceptive_size = ANT_QPOS - robot.num_unobserved + ANT_QVEL
+        self.proprioception = "ant" if body == "gym" else "hiro_ant"
 
     def reset(self, key: Key[Array, ""]) -> State:
         """Start near the origin with Gym's noise, the block where it belongs."""

@@ -39,6 +39,7 @@ class Env(abc.ABC):
     observation_size: int
     action_size: int
     proprioceptive_size: int  # the leading entries of obs that describe the body alone
+    proprioception: str  # name of that slice; may be missing: then it is the task's own, and no other task shares it
     episode_length: int  # ticks
     dt: float  # seconds a tick
 

@@ -47,6 +47,7 @@ class Locomotion(Env):
         self._init_qpos = jnp.asarray(self._start(), jnp.float32)
         state = jax.eval_shape(self.reset, jax.random.key(0))
         self.observation_size = self.proprioceptive_size = state.obs.shape[0]
+        self.proprioception = name
 
     def reset(self, key: Key[Array, ""]) -> State:
         """Start near the initial pose, with Gym's noise."""

@@ -49,6 +49,7 @@ class Navigation(Env):
 
     action_size = 2
     proprioceptive_size = 2
+    proprioception = "point"
     episode_length = 200
     dt = 0.2
 

@@ -17,7 +17,7 @@ import tyro
 
 from taic_jax.config import CollectConfig, Config, EnvConfig, EvaluateConfig, PPOConfig, TrainConfig
 from taic_jax.logging import RunLogger
-from taic_jax.pipeline import make_envs, prepare_folder, train_flat
+from taic_jax.pipeline import make_envs, prepare_folder, train_baseline
 from taic_jax.stage import CLOCK, Clock, Run
 from taic_jax.statistics import bootstrap_interval, iqm
 from taic_jax.summary import commit
@@ -83,7 +83,7 @@ def score(arguments: Arguments, task: str) -> dict[str, str]:
     keys = jnp.stack([jax.random.key(config.seed + k) for k in range(config.seeds)])
     with RunLogger(folder) as logger:
         run = Run(as_arrays(config), keys, folder, logger, Clock.load(folder / CLOCK))
-        last = train_flat(run, make_envs(config)[0]).last
+        last = train_baseline(run, make_envs(config)[0], "flat").last
     returns = np.asarray(last["return"]["return"], float)
     low, high = bootstrap_interval(returns)
     cleanrl, tianshou = PUBLISHED[task]

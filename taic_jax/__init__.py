@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from taic_jax.envs import AutoReset, Env, State, environment_names, make_env
     from taic_jax.evaluate import evaluate, record
     from taic_jax.experience import collect
+    from taic_jax.measures import measure_option_space
     from taic_jax.options.dataset import Experience
     from taic_jax.options.execution import Executor, IdentityExecutor, OptionExecutor, make_executor
     from taic_jax.options.learning import learn
@@ -29,6 +30,7 @@ _MODULES = {
     "envs": ("AutoReset", "Env", "State", "environment_names", "make_env"),
     "evaluate": ("evaluate", "record"),
     "experience": ("collect",),
+    "measures": ("measure_option_space",),
     "options.dataset": ("Experience",),
     "options.execution": ("Executor", "IdentityExecutor", "OptionExecutor", "make_executor"),
     "options.learning": ("learn",),

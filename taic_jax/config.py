@@ -90,16 +90,34 @@ class CollectConfig:
 
 @dataclass(frozen=True)
 class OptionsConfig:
-    """Stage learn: the option model, networks E, D, P and F (sections 3.2 and 3.3)."""
+    """Stage learn: the option model, networks E, D, P and F (sections 3.2 to 3.4)."""
 
+    source: str = ""
+    """Run or artifact whose option model is used as it is (--options for short); empty learns one."""
+    experience: tuple[str, ...] = ()
+    """What to learn from: collect, folders of other runs, demonstrations (.npz, Minari); empty takes collect."""
     length: int = 5
-    """Ticks per window, and so per option."""
+    """Ticks of a window and an option under termination fixed; otherwise the most they may take."""
     size: int = 6
     """Dimensions of the option code o."""
     hidden_size: int = 64
     """Units of the LSTMs of E and D."""
     mlp_sizes: tuple[int, ...] = (64, 64)
     """Widths of the hidden layers of P and F."""
+    decoder: Literal["open", "closed"] = "open"
+    """D in open loop, an LSTM that never looks at the state (the paper's), or in closed loop, pi(a|o,s)."""
+    decoder_sizes: tuple[int, ...] = (128, 128)
+    """Widths of the hidden layers of a closed-loop D."""
+    termination: Literal["fixed", "output", "predict"] = "fixed"
+    """When an option ends: after length ticks, at D's end signal, or when P is surprised (section 3.4)."""
+    shortest: int = 1
+    """Fewest ticks of the windows that termination output learns from."""
+    end_signal: Literal["sampled", "threshold"] = "sampled"
+    """How termination output reads D's end signal: as a probability, or as yes above one half."""
+    delta: float = 0.5
+    """Threshold on P's error at which termination predict ends an option (Algorithm 1)."""
+    delta_unit: Literal["error", "quantile"] = "quantile"
+    """What delta counts: P's error itself, or the share of held-out predictions whose error is smaller."""
     steps: int = 2000
     """Gradient steps."""
     batch_size: int = 128
@@ -114,18 +132,20 @@ class OptionsConfig:
     """Weight of L_adv, which hides the state from the code."""
     lambda_pred: float = 1.0
     """Weight of L_pred, which makes the code's effect predictable."""
+    lambda_end: float = 0.1
+    """Weight of the end signal's cross-entropy under termination output."""
     max_grad_norm: float = 1.0
     """Global norm at which gradients are clipped."""
     since: float = 0.0
     """Share of the experience before the first window."""
     until: float = 1.0
     """Share of the experience before the last window."""
+    parts: int = 1
+    """Equal parts of that span, of each of which select takes its share: 3 mixes early, middle and late."""
     select: Literal["random", "top"] = "top"
     """Which of these windows to learn from: all, or those that collected most reward."""
     fraction: float = 0.5
     """Share of the windows that select top keeps."""
-    termination: Literal["fixed"] = "fixed"
-    """When an option ends; fixed: after length ticks (Fix-len)."""
 
 
 @dataclass(frozen=True)
@@ -134,8 +154,9 @@ class TrainConfig:
 
     ticks: int = 1_000_000
     """Budget of interactions per seed."""
-    flat: bool = True
-    """Also train the flat baseline, unless collect already did."""
+    baselines: tuple[Literal["flat", "repeat", "total", "transfer"], ...] = ("flat",)
+    """Flat PPO beside it: on the task alone; each action held for options.length ticks; given the ticks of collect
+    as well; or starting from the flat policy of the run that options.source names."""
     ppo: PPOConfig = PPOConfig(log_std_init=0.0)
 
 
@@ -176,12 +197,18 @@ BOUNDS: dict[str, tuple[float, float]] = {
     "seed": (0, 2**31 - 1),
     "video_ticks": (0, math.inf),
     "clip": (TINY, math.inf),
+    "delta": (TINY, math.inf),
     "fraction": (TINY, 1),
     "gamma": (0, 1),
     "lambda_": (0, 1),
     "log_std_init": (-20, 2),
     "max_grad_norm": (TINY, math.inf),
 }
+
+
+COLLECT = "collect"
+"""This run's own experience, as a name in `options.experience`."""
+MAY_BE_EMPTY = ("options.experience", "train.baselines")
 
 
 def validate(config: Config) -> None:
@@ -193,9 +220,31 @@ def validate(config: Config) -> None:
     ticks, length = config.train.ppo.rollout_length, config.options.length
     if length > ticks:
         raise _impossible("options.length", length, f"at most train.ppo.rollout_length = {ticks}", ticks)
-    since, until = config.options.since, config.options.until
+    _check_options(config.options)
+    if "transfer" in config.train.baselines and not config.options.source:
+        raise ConfigError("train.baselines: transfer needs the run to start from, as in --options RUN; got none")
+
+
+def _check_options(options: OptionsConfig) -> None:
+    if options.shortest > options.length:
+        expected = f"at most options.length = {options.length}"
+        raise _impossible("options.shortest", options.shortest, expected, options.length)
+    if options.delta_unit == "quantile" and options.delta > 1:
+        raise _impossible("options.delta", options.delta, "at most 1, being a quantile", 1.0)
+    since, until = options.since, options.until
     if since >= until:
         raise _impossible("options.since", since, f"less than options.until = {until}", 0.0)
+
+
+def needs_collect(config: Config) -> bool:
+    """Return whether anything uses what stage collect makes."""
+    learns = not config.options.source and (not config.options.experience or COLLECT in config.options.experience)
+    return learns or ("flat" in config.train.baselines and collector_is_baseline(config))
+
+
+def collector_is_baseline(config: Config) -> bool:
+    """Return whether flat PPO of stage collect is the flat baseline too: on the same task for as many ticks."""
+    return config.collect.env in ("", config.env.name) and config.collect.ticks == config.train.ticks
 
 
 def walk(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -209,7 +258,7 @@ def walk(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def _check_bounds(name: str, value: Any) -> None:
-    if value == ():
+    if value == () and name not in MAY_BE_EMPTY:
         raise ConfigError(f"{name}: expected at least one size, got none; the nearest valid value is 64")
     for number in value if isinstance(value, tuple) else (value,):
         if isinstance(number, bool) or not isinstance(number, int | float):

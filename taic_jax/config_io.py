@@ -44,10 +44,14 @@ def preset_names() -> list[str]:
 
 def mistyped(name: str, kind: Any, value: Any) -> ConfigError:
     """Return the error for a value of the wrong type, with the nearest valid value where there is one."""
-    choices = get_args(kind) if get_origin(kind) is Literal else ("True", "False") if kind is bool else ()
-    nouns = {int: "an integer", float: "a number", str: "text"}
-    other = "a list of integers" if get_origin(kind) is tuple else "a value"
-    expected = f"one of {', '.join(choices)}" if choices else nouns.get(kind, other)
+    item = get_args(kind)[0] if get_origin(kind) is tuple else kind
+    choices = get_args(item) if get_origin(item) is Literal else ("True", "False") if item is bool else ()
+    if item is kind:
+        nouns = {int: "an integer", float: "a number", str: "text"}
+        expected = f"one of {', '.join(choices)}" if choices else nouns.get(kind, "a value")
+    else:
+        plurals = {int: "integers", str: "texts"}
+        expected = "a list of " + (f"some of {', '.join(choices)}" if choices else plurals.get(item, "values"))
     hint = f"; the nearest is {closest(str(value), choices)}" if choices else ""
     if kind is int:
         with contextlib.suppress(ValueError, TypeError, OverflowError):
@@ -117,8 +121,10 @@ def _coerce(name: str, kind: Any, value: Any) -> Any:
         except ValueError:
             pass
     elif get_origin(kind) is tuple and isinstance(value, list):
-        if all(type(item) is int for item in value):
-            return tuple(value)
+        try:
+            return tuple(_coerce(name, get_args(kind)[0], item) for item in value)
+        except ConfigError:
+            raise mistyped(name, kind, value) from None
     elif value in get_args(kind) if get_origin(kind) is Literal else type(value) is kind:
         return value
     raise mistyped(name, kind, value)

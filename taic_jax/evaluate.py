@@ -10,7 +10,7 @@ from jaxtyping import Array, Key
 from taic_jax.envs.base import Env, State
 from taic_jax.envs.wrappers import AutoReset
 from taic_jax.rl.ppo import Agent
-from taic_jax.rl.rollout import Rollout, rollout, start
+from taic_jax.rl.rollout import Rollout, count_durations, rollout, start
 from taic_jax.types import Scalar
 
 
@@ -26,7 +26,8 @@ def evaluate(env: Env, agent: Agent, key: Key[Array, ""], episodes: int, explora
 
     Returns:
       Scalars: `return`, `length` in ticks, and of every metric of the task its mean over the ticks of an episode
-      (`mean/NAME`) and its value at the last tick (`final/NAME`).
+      (`mean/NAME`) and its value at the last tick (`final/NAME`); and `durations` [L], how many options took
+      1, 2, ... L ticks.
     """
     ticks = _run(env, agent, key, episodes, env.episode_length, exploration, _metrics)
     done = (ticks.terminated | ticks.truncated).astype(jnp.float32)
@@ -36,7 +37,8 @@ def evaluate(env: Env, agent: Agent, key: Key[Array, ""], episodes: int, explora
     for name, values in ticks.extras.items():
         result[f"mean/{name}"] = jnp.sum(first * values, axis=0) / length
         result[f"final/{name}"] = jnp.sum(first * done * values, axis=0)
-    return jax.tree.map(jnp.mean, result)
+    durations = count_durations(ticks, agent.executor.length, first > 0)
+    return jax.tree.map(jnp.mean, result) | {"durations": durations}
 
 
 def record(env: Env, agent: Agent, key: Key[Array, ""], ticks: int) -> Any:

@@ -15,8 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Key
 
+from taic_jax.artifacts import DESCRIPTION, read_description
 from taic_jax.checkpoint import ArtifactError
 from taic_jax.config import CollectConfig
+from taic_jax.demonstrations import read_demonstrations
 from taic_jax.envs.base import Env
 from taic_jax.options.dataset import Experience
 from taic_jax.options.execution import IdentityExecutor
@@ -24,6 +26,7 @@ from taic_jax.rl import ppo
 from taic_jax.rl.rollout import Rollout
 from taic_jax.types import as_arrays
 
+EXPERIENCE = "experience"
 FIELDS = ("obs", "action", "reward", "done")
 
 
@@ -100,18 +103,6 @@ class ExperienceStore:
         (self.folder / f"{iteration - self.capacity:06d}.npz").unlink(missing_ok=True)
 
 
-def read_description(folder: Path) -> dict:
-    """Return what a folder of experience is of.
-
-    Raises:
-      ArtifactError: if it is no such folder.
-    """
-    try:
-        return json.loads((folder / "description.json").read_text())
-    except (OSError, ValueError) as error:
-        raise ArtifactError(f"{folder} holds no experience: {error}") from None
-
-
 def read_experience(folder: Path, seed: int) -> Experience:
     """Return all blocks of one seed in time order: [T, B, ...] NumPy arrays.
 
@@ -130,3 +121,20 @@ def read_experience(folder: Path, seed: int) -> Experience:
         except (OSError, EOFError, ValueError, KeyError, IndexError, zipfile.BadZipFile) as error:
             raise ArtifactError(f"{path} is no block of experience with seed {seed}: {error}") from None
     return Experience(**{name: np.concatenate(arrays) for name, arrays in blocks.items()})
+
+
+def gather_experience(source: Path, env: Env, seeds: int) -> Experience:
+    """Return [K, T, B, ...] of what a run collected, or of demonstrations, for the body of `env`.
+
+    Seed k takes the run's seed k modulo their number; demonstrations are every seed's.
+
+    Raises:
+      ArtifactError: nothing readable is there, or it is of another body.
+    """
+    folder = source / EXPERIENCE if (source / EXPERIENCE).is_dir() else source
+    if not (folder / DESCRIPTION).is_file():
+        demonstrations = read_demonstrations(source, env.proprioceptive_size, env.action_size)
+        return jax.tree.map(lambda x: jnp.broadcast_to(x, (seeds, *x.shape)), demonstrations)
+    description = read_description(folder, "experience", env)
+    columns = [read_experience(folder, seed % description["seeds"]) for seed in range(seeds)]
+    return jax.tree.map(lambda *x: jnp.stack(x), *columns)

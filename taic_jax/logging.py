@@ -27,8 +27,8 @@ class RunLogger:
     """Write what a run measures; a context manager.
 
     A row of metrics.jsonl holds `stage`, `ticks`, `time` (seconds since the epoch), and each metric as
-    `stage/name`: a number, or a list with one number per seed. What is not finite is null. Events hold the
-    mean over seeds.
+    `stage/name`: a number, or a list with one number per seed, or per seed a list of counts. What is not finite
+    is null. Events hold the mean over seeds, and of counts a histogram of them all.
 
     Args:
         run_dir: folder of the run; rows that it already holds are kept, but for a half-written last one.
@@ -77,7 +77,7 @@ class RunLogger:
         Args:
             stage: name of the stage; each metric is written as `stage/name`.
             count: interactions, or gradient steps, so far in this stage, per seed.
-            metrics: numbers, or arrays of shape [K] with one number per seed.
+            metrics: numbers, or arrays of shape [K] with one number per seed, or [K, L] with how often 1..L occurred.
             unit: what `count` counts, and its name in the row.
         """
         row: Row = {"stage": stage, unit: count, "time": round(time.time(), 3)}
@@ -113,8 +113,20 @@ class RunLogger:
 
     def _write_events(self, row: Row) -> None:
         for name, value in row.items():
-            if "/" in name and (mean := _mean(value)) is not None:
+            if isinstance(value, list) and value and isinstance(value[0], list):
+                self._write_histogram(name, np.sum(value, axis=0), row)
+            elif "/" in name and (mean := _mean(value)) is not None:
                 self._events.add_scalar(name, mean, _count(row), walltime=row["time"])
+
+    def _write_histogram(self, name: str, counts: np.ndarray, row: Row) -> None:
+        """Write how often each of 1..L occurred."""
+        values = np.arange(1, len(counts) + 1)
+        total, squares = float(counts @ values), float(counts @ values**2)
+        self._events.add_histogram_raw(
+            name, min=0.5, max=len(counts) + 0.5, num=int(counts.sum()), sum=total, sum_squares=squares,
+            bucket_limits=(values + 0.5).tolist(), bucket_counts=counts.tolist(),
+            global_step=_count(row), walltime=row["time"],
+        )  # fmt: skip
 
     def _show(self, task: TaskID, row: Row, unit: Unit) -> None:
         seconds = max(time.monotonic() - self._started, 1e-9)

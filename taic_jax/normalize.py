@@ -17,9 +17,26 @@ Statistics = running_statistics.RunningStatisticsState
 """Mean and standard deviation of everything seen so far, with a 64-bit count."""
 
 
+CARRIED = 1000
+
+
 def init(shape: tuple[int, ...] = ()) -> Statistics:
     """Return statistics of nothing: mean 0, standard deviation 1."""
     return running_statistics.init_state(jnp.zeros(shape))
+
+
+def carry_over(statistics: Statistics, shared: int, size: int) -> Statistics:
+    """Return statistics of `size` entries of which the first `shared` are known from elsewhere.
+
+    They weigh as much as `CARRIED` observations, so that those of the new task soon outweigh them; the other entries
+    start at mean 0 and standard deviation 1.
+    """
+    known: Any = statistics
+    mean = jnp.zeros(size).at[:shared].set(known.mean[:shared])
+    std = jnp.ones(size).at[:shared].set(known.std[:shared])
+    count = known.count
+    count = count.replace(hi=jnp.zeros_like(count.hi), lo=jnp.full_like(count.lo, CARRIED))
+    return known.replace(count=count, mean=mean, std=std, summed_variance=CARRIED * jnp.square(std))
 
 
 def update(statistics: Statistics, batch: Float[Array, "..."]) -> Statistics:

@@ -14,15 +14,17 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from taic_jax.checkpoint import save_tree
-from taic_jax.config import Config, ConfigError, PPOConfig
+from taic_jax.artifacts import OPTIONS, POLICY, describe, load_options, load_policy, save_options, save_policy
+from taic_jax.config import COLLECT, Config, ConfigError, PPOConfig, collector_is_baseline, needs_collect
 from taic_jax.config_io import to_yaml
 from taic_jax.envs import environment_options, make_env
 from taic_jax.envs.base import Env
 from taic_jax.envs.errors import RenderingError
 from taic_jax.evaluate import evaluate
-from taic_jax.experience import ExperienceStore, as_experience, num_blocks, read_experience
+from taic_jax.experience import EXPERIENCE, ExperienceStore, as_experience, gather_experience, num_blocks
 from taic_jax.logging import RunLogger
+from taic_jax.networks import PolicyParams
+from taic_jax.normalize import Statistics
 from taic_jax.options import learning
 from taic_jax.options.dataset import Experience, make_dataset
 from taic_jax.options.execution import Executor, IdentityExecutor, make_executor
@@ -101,16 +103,17 @@ def run_pipeline(config: Config, run_dir: Path, *, resume: bool = False, overwri
     with RunLogger(run_dir) as logger:
         run = Run(as_arrays(config), keys, run_dir, logger, Clock.load(run_dir / CLOCK))
         logger.truncate("evaluate", -1)
-        collector = collect(run, source)
-        model = learn(run, source)
-        taic = train_over_options(run, env, model)
-        # Where experience comes from the task itself, the collector is the flat baseline.
-        flat = collector if source is env else train_flat(run, env) if config.train.flat else None
-    methods = {"taic": taic, **({"flat": flat} if flat else {})}
+        collector = collect(run, source) if needs_collect(config) else None
+        model = frozen_options(run, env) if config.options.source else learn(run, source)
+        methods = {"taic": train_over_options(run, env, model)}
+        for name in config.train.baselines:
+            # Where experience comes from the task itself, the collector is the flat baseline.
+            done = collector if name == "flat" and collector_is_baseline(config) else None
+            methods[name] = done or train_baseline(run, env, name)
     summary = as_summary(run, {name: {"first": x.first, "last": x.last} for name, x in methods.items()})
     (run_dir / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
     try:
-        write_video(run, env, taic.agent)
+        write_video(run, env, methods["taic"].agent)
     except RenderingError as error:  # nothing else depends on it, and all results are saved
         print(f"taic_jax: no video: {error}", file=sys.stderr)
     return summary
@@ -168,10 +171,21 @@ def prepare_folder(config: Config, run_dir: Path, *, resume: bool = False, overw
 
 
 def _train(
-    run: Run, stage: str, level: Level, *model: OptionModel, after: Callable[[int, Experience], None] | None = None
+    run: Run,
+    stage: str,
+    level: Level,
+    *model: OptionModel,
+    after: Callable[[int, Experience], None] | None = None,
+    begin: tuple[PolicyParams, Statistics] | None = None,
 ) -> Trained:
-    """Train one policy per seed and evaluate it before and after."""
+    """Train one policy per seed and evaluate it before and after.
+
+    Where it begins from another's policy, that explores afresh: the standard deviation is the config's.
+    """
     state = jax.jit(jax.vmap(level.init))(run.stage_keys(stage), *model)
+    if begin:
+        params = begin[0].replace(log_std=state.params.log_std)
+        state = state.replace(params=params, obs_statistics=begin[1])
     keys = run.stage_keys("evaluate")
     assess = run.compile(jax.vmap(level.assess), keys, state, *model)
     first = jax.device_get(assess(keys, state, *model))
@@ -185,36 +199,49 @@ def _train(
     return Trained(jax.vmap(level.agent)(state, *model), first, last)
 
 
-def _flat(run: Run, env: Env, ticks: int) -> Level:
-    executor = IdentityExecutor(env.action_size)
+def _flat(run: Run, env: Env, ticks: int, length: int = 1) -> Level:
+    executor = IdentityExecutor(env.action_size, length)
     return Level(env, run.config.collect.ppo, ticks, run.config.evaluate.episodes, lambda: executor)
 
 
 def collect(run: Run, env: Env) -> Trained:
-    """Train flat PPO and keep its trajectories as experience."""
+    """Train flat PPO, keep its trajectories as experience, and save the policy as the artifact `policy`."""
     level = _flat(run, env, run.config.collect.ticks)
-    capacity = num_blocks(run.config.collect)
-    sizes = {"proprioceptive_size": env.proprioceptive_size, "action_size": env.action_size}
-    store = ExperienceStore(run.dir / "experience", capacity, {"env": env.name, **sizes, "seeds": len(run.keys)})
-    return _train(run, "collect", level, after=store.write)
+    store = ExperienceStore(
+        run.dir / EXPERIENCE, num_blocks(run.config.collect), describe(env) | {"seeds": len(run.keys)}
+    )
+    trained = _train(run, "collect", level, after=store.write)
+    save_policy(run.dir / POLICY, trained.agent, env)
+    return trained
 
 
 def learn(run: Run, env: Env) -> OptionModel:
     """Learn one option model per seed from the experience and save it as the artifact `options`."""
-    config = run.config.options
-    experience = [read_experience(run.dir / "experience", seed) for seed in range(len(run.keys))]
-    experience = jax.tree.map(lambda *seeds: jnp.stack(seeds), *experience)
-    dataset = jax.jit(jax.vmap(partial(make_dataset, config=config)))(experience)
+    config, seeds = run.config.options, len(run.keys)
+    names = config.experience or (COLLECT,)
+    sources = [gather_experience(run.dir if name == COLLECT else Path(name), env, seeds) for name in names]
+    dataset = jax.jit(jax.vmap(partial(make_dataset, config=config)))(sources)
+    del sources
+    if not dataset.count.all():
+        raise ConfigError(
+            f"options.length: expected the experience to hold windows of so many ticks, got none of {config.length} "
+            f"in {', '.join(names)} between its shares {float(config.since):g} and {float(config.until):g}"
+        )
     networks = make_networks(config, env.proprioceptive_size, env.action_size)
-    num_envs = experience.obs.shape[2]
-    del experience
     state = jax.jit(jax.vmap(partial(learning.init, config, networks)))(run.stage_keys("learn"))
-    unit = max(n for n in range(1, STEPS_PER_LOG + 1) if config.steps % n == 0)
-    steps = jax.vmap(partial(learning.steps, config, networks, num_envs, unit))
-    state = drive(run, "learn", steps, state, dataset, num_steps=config.steps // unit, unit=unit)
+    if config.steps:  # with none, D stays as random as it was drawn
+        unit = max(n for n in range(1, STEPS_PER_LOG + 1) if config.steps % n == 0)
+        steps = jax.vmap(partial(learning.steps, config, networks, unit))
+        state = drive(run, "learn", steps, state, dataset, num_steps=config.steps // unit, unit=unit)
     model = learning.as_model(state, dataset)
-    save_tree(run.dir / "options", model)
+    save_options(run.dir / OPTIONS, model, env, config)
     return model
+
+
+def frozen_options(run: Run, env: Env) -> OptionModel:
+    """Load the option models that `options.source` names; seed k takes the k-th, modulo their number."""
+    config = run.config.options
+    return load_options(Path(config.source), env, config, len(run.keys))
 
 
 def train_over_options(run: Run, env: Env, model: OptionModel) -> Trained:
@@ -226,6 +253,12 @@ def train_over_options(run: Run, env: Env, model: OptionModel) -> Trained:
     )
 
 
-def train_flat(run: Run, env: Env) -> Trained:
-    """Train the flat baseline on the task itself."""
-    return _train(run, "flat", _flat(run, env, run.config.train.ticks))
+def train_baseline(run: Run, env: Env, name: str) -> Trained:
+    """Train flat PPO on the task: see `TrainConfig.baselines`."""
+    config = run.config
+    ticks = config.train.ticks + (config.collect.ticks if name == "total" else 0)
+    level = _flat(run, env, ticks, config.options.length if name == "repeat" else 1)
+    begin = None
+    if name == "transfer":
+        begin = load_policy(Path(config.options.source), env, config.collect.ppo, len(run.keys))
+    return _train(run, name, level, begin=begin)

@@ -4,6 +4,7 @@ The command is parsed and checked before JAX is imported, so that help and mista
 """
 
 import contextlib
+import dataclasses
 import io
 import itertools
 import os
@@ -37,6 +38,8 @@ class Command:
     """Replace the run in --run-dir."""
     dry_run: tyro.conf.FlagCreatePairsOff[bool] = False
     """Print the configuration and the plan, and stop."""
+    options: Annotated[str, tyro.conf.arg(metavar="RUN")] = ""
+    """Run or artifact whose option model is used as it is; short for --options.source."""
     config: Annotated[Config, tyro.conf.arg(name=""), tyro.conf.FlagConversionOff] = Config()
 
 
@@ -74,6 +77,9 @@ def parse(args: Sequence[str]) -> Command:
         command = _parse_over(args, str(own)) if own.is_file() else command
     elif command.source != first:
         command = _parse_over(args, command.source)
+    if command.options:
+        options = dataclasses.replace(command.config.options, source=command.options)
+        command = dataclasses.replace(command, config=dataclasses.replace(command.config, options=options))
     validate(command.config)
     return command
 

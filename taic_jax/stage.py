@@ -15,7 +15,7 @@ from taic_jax.config import Config
 from taic_jax.logging import RunLogger
 
 S = TypeVar("S")
-STAGES = ("collect", "learn", "train", "flat", "evaluate", "video")
+STAGES = ("collect", "learn", "train", "flat", "evaluate", "video", "repeat", "total", "transfer")
 CHECKPOINT_SECONDS = 30.0
 CLOCK = "clock.json"
 

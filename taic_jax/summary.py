@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from taic_jax.config import Config
+from taic_jax.config import Config, collector_is_baseline, needs_collect
 from taic_jax.envs.base import Env
 from taic_jax.evaluate import record
 from taic_jax.experience import experience_bytes
@@ -24,9 +24,11 @@ MIB = 2**20
 def plan(config: Config, env: Env, source: Env) -> str:
     """Return what a run will cost: interactions and memory, one line a stage."""
     collect, options, train = config.collect, config.options, config.train
-    rows = [("collect", source, collect.ppo, collect.ticks), ("train", env, train.ppo, train.ticks)]
-    if config.collect.env and train.flat:
-        rows.append(("flat", env, collect.ppo, train.ticks))
+    rows = [("collect", source, collect.ppo, collect.ticks)] if needs_collect(config) else []
+    rows.append(("train", env, train.ppo, train.ticks))
+    for name in train.baselines:
+        if not (name == "flat" and collector_is_baseline(config)):
+            rows.append((name, env, collect.ppo, train.ticks + (collect.ticks if name == "total" else 0)))
     lines = []
     for stage, task, ppo, ticks in rows:
         iterations = num_iterations(ppo, ticks)
@@ -34,7 +36,11 @@ def plan(config: Config, env: Env, source: Env) -> str:
         lines.append(f"{stage:8} {task.name}: {real:,} ticks x {config.seeds} seeds in {iterations} iterations")
     kept = min(collect.capacity, collect.ticks)
     size = experience_bytes(source, kept) * config.seeds / MIB
-    lines.insert(1, f"{'learn':8} {options.steps:,} gradient steps on windows of {options.length} ticks")
+    if options.source:
+        return "\n".join([f"{'options':8} as learnt in {options.source}", *lines])
+    lines.insert(
+        needs_collect(config), f"{'learn':8} {options.steps:,} gradient steps on windows of {options.length} ticks"
+    )
     lines.append(f"{'memory':8} experience {size:,.0f} MiB on disk, {2 * size:,.0f} MiB while options are learnt")
     return "\n".join(lines)
 
@@ -63,8 +69,18 @@ def _method(first: Mapping[str, Mapping], last: Mapping[str, Mapping]) -> dict[s
     for mode in last:
         result[mode] = summarize(last[mode]["return"])
         result[mode]["first_per_seed"] = np.asarray(first[mode]["return"], float).tolist()
-    result["metrics"] = {name: summarize(values) for name, values in last["return_mean_option"].items()}
+    metrics = dict(last["return_mean_option"])
+    del metrics["durations"]
+    result["duration"] = _durations(np.asarray(last["return"]["durations"], float))
+    result["metrics"] = {name: summarize(values) for name, values in metrics.items()}
     return result
+
+
+def _durations(counts: np.ndarray) -> dict[str, Any]:
+    """Summarise how many options [K, L] took 1..L ticks: the mean per seed, and the share of each over all seeds."""
+    ticks = np.arange(1, counts.shape[1] + 1)
+    means = counts @ ticks / counts.sum(axis=1)
+    return summarize(means) | {"histogram": (counts.sum(axis=0) / counts.sum()).tolist()}
 
 
 def _version(name: str) -> str | None:

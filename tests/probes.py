@@ -132,18 +132,19 @@ class Repeat(struct.PyTreeNode):
 
     length: int = struct.field(pytree_node=False)
     option_size: int = struct.field(pytree_node=False, default=1)
+    noise_size: int = struct.field(pytree_node=False, default=0)
 
-    def start(self, option: Array, obs: Array) -> tuple[Array, Array]:
-        """Carry the action and the ticks run."""
-        return option, jnp.zeros((), jnp.int32)
+    def start(self, option: Array, obs: Array) -> Array:
+        """Carry the action."""
+        return option
 
-    def act(self, carry: tuple[Array, Array], obs: Array) -> tuple[tuple[Array, Array], Array]:
+    def act(self, carry: Array, obs: Array) -> tuple[Array, Array]:
         """Emit the action, clipped to its bounds."""
-        return (carry[0], carry[1] + 1), jnp.clip(carry[0], -1.0, 1.0)
+        return carry, jnp.clip(carry, -1.0, 1.0)
 
-    def ended(self, carry: tuple[Array, Array], obs: Array) -> Array:
-        """End after `length` ticks."""
-        return carry[1] >= self.length
+    def ended(self, carry: Array, obs: Array, noise: Array) -> Array:
+        """End early where there is noise, and it is positive."""
+        return jnp.any(noise > 0.0)
 
 
 def numbers(tree: Any) -> list[np.ndarray]:

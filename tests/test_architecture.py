@@ -21,7 +21,7 @@ LAYERS = (
     "networks normalize returns",
     "options",
     "rl",
-    "experience evaluate statistics",
+    "experience evaluate statistics artifacts demonstrations measures",
     "logging sweep",
     "stage summary",
     "pipeline",

@@ -44,11 +44,9 @@ def test_without_arguments_the_default_preset_runs(pipeline):
 
 def test_options_override_the_preset_however_they_are_spelled():
     args = ["half_cheetah", "--train.ppo.learning-rate", "1e-2", "--train.ppo.num_envs=32", "--seeds", "3"]
-    config = parse(
-        [*args, "--options.mlp-sizes", "8", "4", "--train.flat", "False", "--train.ppo.lambda_", "0.5"]
-    ).config
+    config = parse([*args, "--options.mlp-sizes", "8", "4", "--train.baselines", "--train.ppo.lambda_", "0.5"]).config
     assert (config.train.ppo.learning_rate, config.train.ppo.num_envs, config.seeds) == (1e-2, 32, 3)
-    assert (config.options.mlp_sizes, config.train.flat, config.train.ppo.lambda_) == ((8, 4), False, 0.5)
+    assert (config.options.mlp_sizes, config.train.baselines, config.train.ppo.lambda_) == ((8, 4), (), 0.5)
     assert config.collect == load_config("half_cheetah").collect
 
 
@@ -101,7 +99,16 @@ BAD_ARGUMENTS = {
     "no value": ("--seed", "--seed: expected an integer", "nothing"),
     "no folder": ("--run-dir", "--run-dir: expected", "nothing"),
     "unknown choice": ("--env.backend mujco", "--env.backend: expected one of auto", "nearest is mujoco"),
-    "case of a bool": ("--train.flat false", "--train.flat: expected one of True, False", "nearest is False"),
+    "case of a bool": (
+        "--train.ppo.learning-rate-decay false",
+        "--train.ppo.learning-rate-decay: expected one of True, False",
+        "nearest is False",
+    ),
+    "unknown baseline": (
+        "--train.baselines flat totl",
+        "--train.baselines: expected a list of some of flat, repeat, total, transfer",
+        "nearest is",
+    ),
     "text in a list": ("--options.mlp-sizes 8 x", "--options.mlp-sizes: expected a list", "'8 x'"),
     "config after a list": ("--options.mlp-sizes 8 ant", "--options.mlp-sizes: expected a list", "'8 ant'"),
     "empty list": ("--options.mlp-sizes", "options.mlp_sizes: expected at least one", "64"),

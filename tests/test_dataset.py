@@ -22,7 +22,7 @@ def datasets_of(experience: Experience) -> dict[str, Dataset]:
     return {config.select: make_dataset(experience, as_arrays(config)) for config in both}
 
 
-gather_windows = jax.jit(gather, static_argnums=(2, 3))
+gather_windows = jax.jit(gather, static_argnums=3)
 
 
 def make_experience(done: np.ndarray, seed: int = 0) -> Experience:
@@ -42,7 +42,7 @@ def valid_starts(done: np.ndarray) -> set[tuple[int, int]]:
 
 
 def selected(dataset: Dataset) -> list[tuple[int, int]]:
-    return [(int(row) // B, int(row) % B) for row in np.asarray(dataset.starts)[: int(dataset.count)]]
+    return [(int(row) % T, int(row) // T) for row in np.asarray(dataset.starts)[: int(dataset.count)]]
 
 
 dones = st.lists(st.booleans(), min_size=T * B, max_size=T * B)
@@ -79,11 +79,10 @@ def test_windows_hold_their_own_environments_ticks():
     done = np.zeros((T, B), bool)
     done[5, 1] = True
     dataset = datasets_of(make_experience(done))["random"]
-    windows = gather_windows(dataset, jnp.arange(int(dataset.count)), LENGTH, B)
+    windows = gather_windows(dataset, jnp.arange(int(dataset.count)), jnp.full(int(dataset.count), LENGTH), LENGTH)
     for i, (t, b) in enumerate(selected(dataset)):
-        np.testing.assert_array_equal(windows.start[i], [t, b])
+        np.testing.assert_array_equal(windows.states[i], [[t + k, b] for k in range(LENGTH + 1)])
         np.testing.assert_array_equal(windows.actions[i, :, 0], [100 * (t + k) + b for k in range(LENGTH)])
-        np.testing.assert_array_equal(windows.end[i], [t + LENGTH, b])
     assert windows.mask.all() and windows.mask.shape == windows.actions.shape[:2]
 
 

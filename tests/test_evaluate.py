@@ -38,6 +38,9 @@ class Earning(Probe):
 
 def run(env: Probe, seed: int = 0) -> dict[str, float]:
     result = jax.jit(partial(evaluate, env, AGENT, episodes=EPISODES))(jax.random.key(seed))
+    # Every tick is of one option, and of those that began in the first episodes only.
+    np.testing.assert_allclose(result["durations"] @ jnp.array([1.0, 2.0]), EPISODES * result["length"], rtol=1e-5)
+    assert result.pop("durations")[1] > 0
     return {name: float(value) for name, value in result.items()}
 
 

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 from probes import Counting, assert_trees_equal
 
+from taic_jax.artifacts import describe
 from taic_jax.checkpoint import ArtifactError
 from taic_jax.config import CollectConfig, PPOConfig
-from taic_jax.experience import ExperienceStore, collect, num_blocks, read_description, read_experience
+from taic_jax.envs import make_env
+from taic_jax.experience import ExperienceStore, collect, gather_experience, num_blocks, read_experience
 from taic_jax.options.dataset import Experience
 
 K, T, B = 2, 4, 3
@@ -62,10 +64,24 @@ def test_a_write_that_fails_leaves_what_was_there(tmp_path, monkeypatch):
     assert_trees_equal(read_experience(tmp_path, 1), jax.tree.map(lambda x: x[1], block(0)))
 
 
-def test_reads_back_its_description(tmp_path):
-    description = {"env": "ant", "proprioceptive_size": 27, "seeds": 2}
-    ExperienceStore(tmp_path, 1, description)
-    assert read_description(tmp_path) == description
+def test_gathers_what_a_run_collected_for_its_own_body(tmp_path):
+    env = Counting(100)
+    ExperienceStore(tmp_path / "experience", 1, describe(env) | {"seeds": 2}).write(0, block(0))
+    for source in (tmp_path, tmp_path / "experience"):
+        gathered = gather_experience(source, env, 3)
+        # Seed 2 takes the run's seed 0.
+        for seed, column in enumerate((0, 1, 0)):
+            np.testing.assert_array_equal(gathered.obs[seed], block(0).obs[column])
+    with pytest.raises(ArtifactError, match="proprioception: expected 'point'.*got 'probe'"):
+        gather_experience(tmp_path, make_env("nav2d"), 1)
+
+
+def test_gathers_demonstrations_for_every_seed(tmp_path):
+    arrays = {"obs": np.zeros((5, 1)), "action": np.full((5, 1), 0.5), "reward": np.arange(5.0)}
+    np.savez(tmp_path / "demo.npz", **arrays, done=np.arange(5) == 1)
+    gathered = gather_experience(tmp_path / "demo.npz", Counting(100), 2)
+    np.testing.assert_array_equal(gathered.reward, np.broadcast_to(np.arange(5.0)[:, None], (2, 5, 1)))
+    assert gathered.done[0, :, 0].tolist() == [False, True, False, False, True]
 
 
 def damaged(folder):
@@ -100,8 +116,8 @@ def test_refuses_missing_folders_and_seeds(tmp_path):
     attempts = [
         lambda: read_experience(tmp_path / "none", 0),
         lambda: read_experience(tmp_path / "some", K),
-        lambda: read_description(tmp_path / "none"),
-        lambda: read_description(tmp_path / "torn"),
+        lambda: gather_experience(tmp_path / "none", Counting(100), 1),
+        lambda: gather_experience(tmp_path / "torn", Counting(100), 1),
     ]
     for attempt in attempts:
         with pytest.raises(ArtifactError) as error:

@@ -75,11 +75,10 @@ def problem() -> tuple[dict, OptionModel, Window, jax.Array]:
         params,
         Scale(draw(STATE_SIZE), jnp.exp(draw(STATE_SIZE))),
         Scale(draw(STATE_SIZE), jnp.exp(draw(STATE_SIZE))),
+        jnp.ones(()),
     )
     mask = jnp.tile(jnp.array([True, True, False]), (NUM_WINDOWS, 1))
-    windows = Window(
-        draw(NUM_WINDOWS, STATE_SIZE), draw(NUM_WINDOWS, 3, ACTION_SIZE), draw(NUM_WINDOWS, STATE_SIZE), mask
-    )
+    windows = Window(draw(NUM_WINDOWS, 4, STATE_SIZE), draw(NUM_WINDOWS, 3, ACTION_SIZE), mask)
     return params, model, windows, draw(NUM_WINDOWS, CONFIG.size)
 
 
@@ -97,7 +96,7 @@ def adversarial_alone(params: dict, model: OptionModel, windows: Window, noise: 
         means, log_stds = NETWORKS.encoder.apply(params["encoder"], window.actions)
         option = means[1] + jnp.exp(log_stds[1]) * noise  # the last action of the mask is the second
         estimated = NETWORKS.estimator.apply(params["estimator"], option)
-        true = jnp.stack([model.state_scale(window.start), model.state_scale(window.end)])
+        true = model.state_scale(window.states[jnp.array([0, 2])])  # the last action leads to the third state
         return jnp.mean((estimated - true) ** 2)
 
     return jnp.mean(jax.vmap(one)(windows, noise))

@@ -27,16 +27,17 @@ def model() -> OptionModel:
     shapes = jax.eval_shape(lambda: init_params(NETWORKS, CONFIG, jax.random.key(0)))
     params = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=leaf.shape), jnp.float32), shapes)
     scale = Scale(jnp.zeros(STATE_SIZE), jnp.ones(STATE_SIZE))
-    return OptionModel(params, scale, scale)
+    return OptionModel(params, scale, scale, jnp.ones(()))
 
 
 def test_decoder_steps_are_the_unrolled_call(model):
     decoder, params, option = NETWORKS.decoder, model.params["decoder"], jnp.array([0.5, -1.0])
-    actions, logits = jax.jit(decoder.apply, static_argnums=2)(params, option, 5)
-    step = jax.jit(lambda carry: decoder.apply(params, carry, option, method="step"))
+    states = jnp.asarray(np.random.default_rng(3).normal(size=(5, STATE_SIZE)), jnp.float32)
+    actions, logits = jax.jit(decoder.apply)(params, option, states)
+    step = jax.jit(lambda carry, state: decoder.apply(params, carry, option, state, method="step"))
     carry = decoder.apply(params, option, method="start")
     for i in range(5):
-        carry, (action, logit) = step(carry)
+        carry, (action, logit) = step(carry, states[i])
         np.testing.assert_allclose(action, actions[i], rtol=1e-5, atol=1e-6)
         np.testing.assert_allclose(logit, logits[i], rtol=1e-5, atol=1e-6)
     assert np.abs(np.diff(actions, axis=0)).min() > 1e-3  # one action is not another
@@ -53,16 +54,17 @@ def test_encoder_gives_every_prefix_at_once(model):
         np.testing.assert_allclose(log_std[-1], log_stds[i], rtol=1e-5, atol=1e-6)
 
 
-def test_executor_emits_the_decoders_actions_and_ends_after_its_length(model):
+def test_executor_emits_the_decoders_actions_and_never_ends_early(model):
     executor, option = make_executor(CONFIG, ACTION_SIZE, model), jnp.array([3.0, -2.0])
     assert isinstance(executor, OptionExecutor) and executor.option_size == CONFIG.size
-    decoded, _ = NETWORKS.decoder.apply(model.params["decoder"], option, CONFIG.length)
+    decoded, _ = NETWORKS.decoder.apply(model.params["decoder"], option, jnp.zeros((CONFIG.length, STATE_SIZE)))
     act, carry = jax.jit(executor.act), executor.start(option, jnp.zeros(7))
     for i in range(CONFIG.length):
         # An observation may have more entries than the slice the model knows.
         carry, action = act(carry, jnp.full(7, float(i)))
         np.testing.assert_allclose(action, np.clip(decoded[i], -1.0, 1.0), rtol=1e-5, atol=1e-6)
-        assert executor.ended(carry, jnp.zeros(7)) == (i + 1 == CONFIG.length)
+        assert not executor.ended(carry, jnp.zeros(7), jnp.zeros(0))
+    assert (executor.length, executor.noise_size) == (CONFIG.length, 0)
     assert np.abs(decoded).max() > 1.0  # so that the clipping was seen
 
 

@@ -1,5 +1,6 @@
-"""Windows of experience: action sequences with their start and end states."""
+"""Windows of experience: action sequences with the states they pass through."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -9,6 +10,14 @@ from jaxtyping import Array, Float, Int
 
 from taic_jax.config import OptionsConfig
 from taic_jax.options.model import Scale
+
+# Every tenth stretch of experience is held out where P's error on unseen windows is needed. A stretch is
+# several windows long, so that few of its windows reach into what is learnt from.
+HELD_OUT_EVERY, STRETCH = 10, 8
+
+
+class ShortExperienceError(ValueError):
+    """The experience is too short for what is asked of it."""
 
 
 class Experience(struct.PyTreeNode):
@@ -21,24 +30,24 @@ class Experience(struct.PyTreeNode):
 
 
 class Window(struct.PyTreeNode):
-    """One action sequence; `mask` [L] marks the actions that belong to it."""
+    """L actions and the L + 1 states around them; `mask` [L] marks the actions that belong to the window."""
 
-    start: Array
+    states: Array
     actions: Array
-    end: Array
     mask: Array
 
 
 class Dataset(struct.PyTreeNode):
-    """Experience flattened to rows, and the rows at which a selected window starts.
+    """Experience flattened to rows, one environment after another, and the rows at which a selected window starts.
 
-    `starts` [T*B] is sorted best first and only its first `count` entries are valid: their number depends on
-    the data, the array's size must not. Row t*B + b is environment b at tick t.
+    `starts` has one entry per row. Its first `count` are the windows to learn from, the next `held_out` those that
+    are not learnt from; the rest is void, since the numbers depend on the data and the array's size must not.
     """
 
     experience: Experience
     starts: Array
     count: Array
+    held_out: Array
     state_scale: Scale
     change_scale: Scale
 
@@ -56,28 +65,79 @@ def window_score(reward: Float[Array, "T B"], done: Array, length: int) -> tuple
     return total, ~crosses & inside[:, None]
 
 
-def make_dataset(experience: Experience, config: OptionsConfig) -> Dataset:
+def make_dataset(experience: Experience | Sequence[Experience], config: OptionsConfig) -> Dataset:
     """Select windows of `config.length` ticks and measure the scales over them.
 
-    Windows start between the shares `since` and `until` of the experience. Of these, `select="top"` keeps the
-    `fraction` that collected most reward (§4.2.2), `select="random"` keeps all.
+    Windows start between the shares `since` and `until` of each experience, a span that is cut into `parts`. Of each
+    part, `select="top"` keeps the `fraction` that collected most reward (§4.2.2), `select="random"` keeps all.
+
+    Args:
+      experience: one, or several of the same body; selected from each by itself, then merged.
+      config: how to select.
+
+    Raises:
+      ShortExperienceError: windows are to be held out, and none of the experiences is long enough.
     """
-    num_ticks, num_envs = experience.reward.shape
-    score, valid = window_score(experience.reward, experience.done, config.length)
-    when = (jnp.arange(num_ticks, dtype=jnp.float32) / num_ticks)[:, None]
-    valid = valid & (config.since <= when) & (when < config.until)
-    score, valid = score.reshape(-1), valid.reshape(-1)
-    count = jnp.sum(valid, dtype=jnp.int32)
-    if config.select == "top":
-        starts = jnp.argsort(jnp.where(valid, -score, jnp.inf))
-        count = jnp.maximum((count.astype(jnp.float32) * config.fraction).astype(jnp.int32), 1)
-    else:
-        starts = jnp.argsort(~valid, stable=True)
-    rows = jax.tree.map(lambda x: x.reshape((-1, *x.shape[2:])), experience)
+    sources = [experience] if isinstance(experience, Experience) else list(experience)
+    needed = STRETCH * HELD_OUT_EVERY * config.length
+    if _holds_out(config) and all(len(source.reward) < needed for source in sources):
+        raise ShortExperienceError(
+            f"options.delta_unit: quantile needs {needed} ticks of each environment, to hold every tenth stretch of "
+            f"{STRETCH} windows out; got {max(len(source.reward) for source in sources)}; error needs none"
+        )
+    num_parts = len(sources) * config.parts
+    columns = [_candidates(source, config, i * config.parts) for i, source in enumerate(sources)]
+    score, part, held_out = (jnp.concatenate(column) for column in zip(*columns, strict=True))
+    part = jnp.where(jnp.isfinite(score), part, num_parts)  # where no window may start
+    order, kept = _select(score, part, num_parts, config)
+    group = jnp.where(kept, held_out[order].astype(jnp.int32), 2)
+    starts = order[jnp.argsort(group, stable=True)]
+    count, held = jnp.sum(group == 0, dtype=jnp.int32), jnp.sum(group == 1, dtype=jnp.int32)
+    rows: Any = jax.tree.map(lambda *x: jnp.concatenate([_flatten(y) for y in x]), *sources)
     probe = starts[(jnp.arange(100_000.0) * (count.astype(jnp.float32) / 1e5)).astype(jnp.int32)]
     state = rows.obs[probe]
-    change = rows.obs[probe + config.length * num_envs] - state
-    return Dataset(rows, starts, count, _scale(state), _scale(change))
+    change = rows.obs[probe + config.length] - state
+    return Dataset(rows, starts, count, held, _scale(state), _scale(change))
+
+
+def _holds_out(config: OptionsConfig) -> bool:
+    """Return whether P's error on windows that were not learnt from is asked for."""
+    return config.termination == "predict" and config.delta_unit == "quantile"
+
+
+def _candidates(experience: Experience, config: OptionsConfig, first_part: int) -> tuple[Array, Array, Array]:
+    """Return for every row the score of the window from there, or NaN, its part, and whether it is held out."""
+    num_ticks, num_envs = experience.reward.shape
+    score, valid = window_score(experience.reward, experience.done, config.length)
+    tick = jnp.arange(num_ticks)
+    share = tick.astype(jnp.float32) / num_ticks
+    valid = valid & ((config.since <= share) & (share < config.until))[:, None]
+    part = ((share - config.since) / (config.until - config.since) * config.parts).astype(jnp.int32)
+    held_out = (tick // (STRETCH * config.length)) % HELD_OUT_EVERY == HELD_OUT_EVERY - 1
+    held_out = held_out & _holds_out(config)
+    return (
+        _flatten(jnp.where(valid, score, jnp.nan)),
+        jnp.tile(first_part + jnp.clip(part, 0, config.parts - 1), num_envs),
+        jnp.tile(held_out, num_envs),
+    )
+
+
+def _select(
+    score: Float[Array, " R"], part: Int[Array, " R"], num_parts: int, config: OptionsConfig
+) -> tuple[Int[Array, " R"], Array]:
+    """Return the rows in order of part and score, and which of them, in this order, are kept."""
+    order = jnp.lexsort((-score, part))
+    part = part[order]
+    sizes = jnp.bincount(part, length=num_parts + 1)
+    rank = jnp.arange(len(part)) - (jnp.cumsum(sizes) - sizes)[part]
+    share = config.fraction if config.select == "top" else 1.0
+    quota = jnp.maximum((sizes.astype(jnp.float32) * share).astype(jnp.int32), 1)
+    return order, (rank < quota[part]) & (part < num_parts)
+
+
+def _flatten(x: Array) -> Array:
+    """Join T and B, one environment after another."""
+    return jnp.swapaxes(x, 0, 1).reshape((-1, *x.shape[2:]))
 
 
 def _scale(x: Float[Array, "N P"]) -> Scale:
@@ -86,10 +146,8 @@ def _scale(x: Float[Array, "N P"]) -> Scale:
     return Scale(jnp.mean(x, axis=0), jnp.where(std < 1e-4, 1.0, std))
 
 
-def gather(dataset: Dataset, which: Int[Array, " N"], length: int, num_envs: int) -> Window:
-    """Return the windows at positions `which` of the selection, leading axis N."""
-    start = dataset.starts[which]
-    rows = start[:, None] + num_envs * jnp.arange(length)[None]
-    experience = dataset.experience
-    mask = jnp.ones((which.shape[0], length), bool)
-    return Window(experience.obs[start], experience.action[rows], experience.obs[start + length * num_envs], mask)
+def gather(dataset: Dataset, which: Int[Array, " N"], ticks: Int[Array, " N"], length: int) -> Window:
+    """Return the windows at positions `which` of `starts`, of `ticks` <= `length` ticks each; leading axis N."""
+    rows = dataset.starts[which][:, None] + jnp.arange(length + 1)[None]
+    mask = jnp.arange(length)[None] < ticks[:, None]
+    return Window(dataset.experience.obs[rows], dataset.experience.action[rows[:, :-1]], mask)

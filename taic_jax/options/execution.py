@@ -1,4 +1,4 @@
-"""Executors: what turns an option into primitive actions until its termination rule ends it (§3.4)."""
+"""Executors: what turns an option into primitive actions, tick by tick (§3.4)."""
 
 from typing import Any, Protocol, runtime_checkable
 
@@ -9,15 +9,26 @@ from jaxtyping import Array, Bool, Float
 from taic_jax.config import OptionsConfig
 from taic_jax.networks import apply
 from taic_jax.options.model import Networks, OptionModel, make_networks
+from taic_jax.options.termination import Termination, make_termination
 
 
 @runtime_checkable
 class Executor(Protocol):
-    """Run one option, unbatched: the caller vmaps."""
+    """Run one option, unbatched: the caller vmaps, and ends every option after at most `length` ticks."""
 
     @property
     def option_size(self) -> int:
         """D."""
+        ...
+
+    @property
+    def length(self) -> int:
+        """L, the most ticks an option takes."""
+        ...
+
+    @property
+    def noise_size(self) -> int:
+        """How many standard normal numbers the termination rule takes each tick."""
         ...
 
     def start(self, option: Float[Array, " D"], obs: Float[Array, " S"]) -> Any:
@@ -28,15 +39,17 @@ class Executor(Protocol):
         """Return the next carry and the action, each entry in [-1, 1]."""
         ...
 
-    def ended(self, carry: Any, obs: Float[Array, " S"]) -> Bool[Array, ""]:
-        """Return beta(s, o) for the observation after the tick."""
+    def ended(self, carry: Any, obs: Float[Array, " S"], noise: Float[Array, " X"]) -> Bool[Array, ""]:
+        """Return beta(s, o) for the observation after the tick, true where the option ends before `length`."""
         ...
 
 
 class IdentityExecutor(struct.PyTreeNode):
-    """Flat control: the option is the action and ends after one tick."""
+    """Flat control: the option is the action, held for `length` ticks, by default one."""
 
     option_size: int = struct.field(pytree_node=False)
+    length: int = struct.field(pytree_node=False, default=1)
+    noise_size: int = struct.field(pytree_node=False, default=0)
 
     def start(self, option: Float[Array, " A"], obs: Float[Array, " S"]) -> Float[Array, " A"]:
         """Carry the action itself."""
@@ -46,24 +59,25 @@ class IdentityExecutor(struct.PyTreeNode):
         """Emit the action, clipped to its bounds."""
         return carry, jnp.clip(carry, -1.0, 1.0)
 
-    def ended(self, carry: Float[Array, " A"], obs: Float[Array, " S"]) -> Bool[Array, ""]:
-        """End always."""
-        return jnp.ones((), bool)
+    def ended(self, carry: Float[Array, " A"], obs: Float[Array, " S"], noise: Array) -> Bool[Array, ""]:
+        """Never end early."""
+        return jnp.zeros((), bool)
 
 
 class Decoding(struct.PyTreeNode):
-    """A running option: its code, D's carry, and the ticks it has run."""
+    """A running option: its code, D's carry, and what the termination rule remembers of it."""
 
     option: Array
     carry: Any
-    tick: Array
+    memory: Any
 
 
 class OptionExecutor(struct.PyTreeNode):
-    """D behind its termination rule: `fixed` ends every option after `length` ticks (§3.4.1)."""
+    """D, and the termination rule that ends what D does."""
 
     model: OptionModel
     networks: Networks = struct.field(pytree_node=False)
+    termination: Termination = struct.field(pytree_node=False)
     length: int = struct.field(pytree_node=False)
 
     @property
@@ -71,23 +85,35 @@ class OptionExecutor(struct.PyTreeNode):
         """D."""
         return self.networks.encoder.option_size
 
+    @property
+    def noise_size(self) -> int:
+        """How many standard normal numbers the termination rule takes each tick."""
+        return self.termination.noise_size
+
     def start(self, option: Float[Array, " D"], obs: Float[Array, " S"]) -> Decoding:
         """Set D's carry from the code."""
         carry = apply(self.networks.decoder, self.model.params["decoder"], option, method="start")
-        return Decoding(option, carry, jnp.zeros((), jnp.int32))
+        return Decoding(option, carry, self.termination.start(self.networks, self.model, self._state(obs)))
 
     def act(self, carry: Decoding, obs: Float[Array, " S"]) -> tuple[Decoding, Float[Array, " A"]]:
         """Emit D's next action, clipped to its bounds."""
-        params = self.model.params["decoder"]
-        memory, (action, _) = apply(self.networks.decoder, params, carry.carry, carry.option, method="step")
-        return Decoding(carry.option, memory, carry.tick + 1), jnp.clip(action, -1.0, 1.0)
+        params, state = self.model.params["decoder"], self.model.state_scale(self._state(obs))
+        step = apply(self.networks.decoder, params, carry.carry, carry.option, state, method="step")
+        memory, (action, end_logit) = step
+        action = jnp.clip(action, -1.0, 1.0)
+        followed = self.termination.follow(self.networks, self.model, carry.memory, action, end_logit)
+        return Decoding(carry.option, memory, followed), action
 
-    def ended(self, carry: Decoding, obs: Float[Array, " S"]) -> Bool[Array, ""]:
-        """End after `length` ticks, whatever the state."""
-        return carry.tick >= self.length
+    def ended(self, carry: Decoding, obs: Float[Array, " S"], noise: Float[Array, " X"]) -> Bool[Array, ""]:
+        """Ask the termination rule."""
+        return self.termination.ended(self.networks, self.model, carry.memory, self._state(obs), noise)
+
+    def _state(self, obs: Float[Array, " S"]) -> Float[Array, " P"]:
+        """Return the proprioceptive slice: an observation may have more entries than the model knows."""
+        return obs[: self.model.state_scale.mean.shape[-1]]
 
 
 def make_executor(config: OptionsConfig, action_size: int, model: OptionModel) -> OptionExecutor:
     """Return the executor of an option model under the config's termination rule."""
     networks = make_networks(config, model.state_scale.mean.shape[-1], action_size)
-    return OptionExecutor(model, networks, config.length)
+    return OptionExecutor(model, networks, make_termination(config), config.length)

@@ -1,5 +1,6 @@
-"""Learning options from windows: E, D, P and F jointly (§3.2, §3.3)."""
+"""Learning options from windows: E, D, P and F jointly (§3.2-3.4, Algorithm 1)."""
 
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -7,27 +8,26 @@ import jax
 import jax.numpy as jnp
 import optax
 from flax import struct
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Float, Int, Key
 
 from taic_jax.config import OptionsConfig
 from taic_jax.networks import apply
 from taic_jax.options.dataset import Dataset, Experience, Window, gather, make_dataset
-from taic_jax.options.losses import (
-    adversarial_loss,
-    gradient_reversal,
-    kl_loss,
-    prediction_loss,
-    reconstruction_loss,
-)
+from taic_jax.options.losses import adversarial_loss, end_loss, gradient_reversal, kl_loss, reconstruction_loss
 from taic_jax.options.model import Networks, OptionModel, init_params, make_networks
+from taic_jax.options.termination import prefix_errors, stop_index
 from taic_jax.types import Scalar, as_arrays
+
+DELTA_MEMORY = 100.0
+"""Steps over which a threshold that is a quantile is averaged."""
 
 
 class LearnState(struct.PyTreeNode):
-    """Everything a learning run is: saved and restored whole."""
+    """Everything a learning run is: saved and restored whole; `delta` [] is the threshold in force."""
 
     params: dict
     optimizer: optax.OptState
+    delta: Array
     key: Array
     step: Array
 
@@ -48,32 +48,45 @@ def init(config: OptionsConfig, networks: Networks, key: Key[Array, ""]) -> Lear
     """Return the state before the first step."""
     key, key_params = jax.random.split(key)
     params = init_params(networks, config, key_params)
-    return LearnState(params, make_optimizer(config).init(params), key, jnp.zeros((), jnp.int32))
+    delta = jnp.asarray(config.delta if config.delta_unit == "error" else jnp.inf, jnp.float32)
+    return LearnState(params, make_optimizer(config).init(params), delta, key, jnp.zeros((), jnp.int32))
 
 
 def window_losses(
     params: dict, networks: Networks, model: OptionModel, config: OptionsConfig, window: Window, noise: Array
 ) -> dict[str, Array]:
-    """Return the losses of one window, `noise` [D] drawing o from q(o|a).
+    """Return the losses of one window and its duration, `noise` [D] drawing every o_i from q(o|a_0..a_i).
 
-    The sum E descends is L_recons + lambda_kl L_KL + lambda_pred L_pred - lambda_adv L_adv, and F descends
-    L_adv: the reversal in front of F changes the sign on its way into E and nowhere else.
+    The sum E descends is L_recons + lambda_kl L_KL + lambda_pred L_pred - lambda_adv L_adv (and, where D emits an
+    end signal, lambda_end times its loss), and F descends L_adv: the reversal in front of F changes the sign on its
+    way into E and nowhere else. Under termination predict the window is cut where Algorithm 1 stops, and L_pred is
+    the sum over the prefixes up to there; else it is of the whole window.
     """
+    model = model.replace(params=params)
     means, log_stds = apply(networks.encoder, params["encoder"], window.actions)
     last = jnp.sum(window.mask, dtype=jnp.int32) - 1
+    mask = window.mask
+    if config.termination == "predict":
+        errors = prefix_errors(networks, model, means + jnp.exp(log_stds) * noise[None], window.states)
+        last = stop_index(errors, model.delta)
+        mask = jnp.arange(len(errors)) <= last
+        prediction = jnp.sum(jnp.where(mask, errors, 0.0))
     mean, log_std = means[last], log_stds[last]
     option = mean + jnp.exp(log_std) * noise
-    decoded, _ = apply(networks.decoder, params["decoder"], option, window.actions.shape[0])
-    start, end = model.state_scale(window.start), model.state_scale(window.end)
-    change = model.change_scale(window.end - window.start)
-    predicted = apply(networks.predictor, params["predictor"], start, option)
+    states = model.state_scale(window.states)
+    if config.termination != "predict":
+        reached = jnp.stack([window.states[0], window.states[last + 1]])
+        prediction = prefix_errors(networks, model, option[None], reached)[0]
+    decoded, end_logit = apply(networks.decoder, params["decoder"], option, states[:-1])
     estimated = apply(networks.estimator, params["estimator"], gradient_reversal(option, config.lambda_adv))
-    return {
-        "reconstruction_loss": reconstruction_loss(decoded, window.actions, window.mask),
+    losses = {
+        "reconstruction_loss": reconstruction_loss(decoded, window.actions, mask),
         "kl_loss": kl_loss(mean, log_std),
-        "prediction_loss": prediction_loss(predicted, change),
-        "adversarial_loss": adversarial_loss(estimated, start, end),
+        "prediction_loss": prediction,
+        "adversarial_loss": adversarial_loss(estimated, states[0], states[last + 1]),
+        "duration": (last + 1).astype(jnp.float32),
     }
+    return losses | ({"end_loss": end_loss(end_logit, mask)} if config.termination == "output" else {})
 
 
 def total_loss(
@@ -87,49 +100,82 @@ def total_loss(
         + config.lambda_kl * losses["kl_loss"]
         + config.lambda_pred * losses["prediction_loss"]
         + losses["adversarial_loss"]
+        + config.lambda_end * losses.get("end_loss", 0.0)
     )
     return total, losses
 
 
 def step(
-    config: OptionsConfig, networks: Networks, dataset: Dataset, num_envs: int, state: LearnState
+    config: OptionsConfig, networks: Networks, dataset: Dataset, state: LearnState
 ) -> tuple[LearnState, dict[str, Array]]:
     """Take one gradient step on a batch of windows drawn at random from the selection."""
-    key, key_windows, key_option = jax.random.split(state.key, 3)
-    which = jax.random.randint(key_windows, (config.batch_size,), 0, dataset.count)
-    windows = gather(dataset, which, config.length, num_envs)
+    key, key_windows, key_option, key_delta = jax.random.split(state.key, 4)
+    if config.termination == "predict" and config.delta_unit == "quantile":
+        state = state.replace(delta=_measure_delta(config, networks, dataset, state, key_delta))
+    windows = _draw(config, dataset, key_windows, jnp.zeros((), jnp.int32), dataset.count)
     noise = jax.random.normal(key_option, (config.batch_size, config.size))
     model = as_model(state, dataset)
     gradient, losses = jax.grad(total_loss, has_aux=True)(state.params, networks, model, config, windows, noise)
     with jax.numpy_dtype_promotion("standard"):  # Optax raises a float to an integer power
         updates, optimizer = make_optimizer(config).update(gradient, state.optimizer)
     params: Any = optax.apply_updates(state.params, updates)
-    return LearnState(params, optimizer, key, state.step + 1), losses
+    if config.termination == "predict":
+        losses = losses | {"delta": state.delta}
+    return LearnState(params, optimizer, state.delta, key, state.step + 1), losses
+
+
+def _draw(
+    config: OptionsConfig, dataset: Dataset, key: Key[Array, ""], first: Int[Array, ""], count: Int[Array, ""]
+) -> Window:
+    """Draw a batch among the windows first..first + count; under termination output their length is drawn too."""
+    key_which, key_ticks = jax.random.split(key)
+    which = first + jax.random.randint(key_which, (config.batch_size,), 0, count)
+    shortest = config.shortest if config.termination == "output" else config.length
+    ticks = jax.random.randint(key_ticks, (config.batch_size,), shortest, config.length + 1)
+    return gather(dataset, which, ticks, config.length)
+
+
+def _measure_delta(
+    config: OptionsConfig, networks: Networks, dataset: Dataset, state: LearnState, key: Key[Array, ""]
+) -> Float[Array, ""]:
+    """Return the quantile `config.delta` of P's errors on held-out windows, averaged over the latest steps."""
+    windows = _draw(config, dataset, key, dataset.count, dataset.held_out)
+    model = as_model(state, dataset)
+    encode = partial(apply, networks.encoder, state.params["encoder"])
+    errors = partial(prefix_errors, networks, model)
+    measured = jax.vmap(lambda window: errors(encode(window.actions)[0], window.states))(windows)
+    quantile = jnp.quantile(measured, config.delta)
+    return jnp.where(state.step == 0, quantile, state.delta + (quantile - state.delta) / DELTA_MEMORY)
 
 
 def steps(
-    config: OptionsConfig, networks: Networks, num_envs: int, count: int, state: LearnState, dataset: Dataset
+    config: OptionsConfig, networks: Networks, count: int, state: LearnState, dataset: Dataset
 ) -> tuple[LearnState, dict[str, Array], None]:
     """Take `count` gradient steps and return the mean losses."""
-    one = partial(step, config, networks, dataset, num_envs)
-    state, losses = jax.lax.scan(lambda s, _: one(s), state, None, count)
+    state, losses = jax.lax.scan(lambda s, _: step(config, networks, dataset, s), state, None, count)
     return state, jax.tree.map(jnp.mean, losses), None
 
 
 def as_model(state: LearnState, dataset: Dataset) -> OptionModel:
     """Return the option model learnt so far."""
-    return OptionModel(state.params, dataset.state_scale, dataset.change_scale)
+    return OptionModel(state.params, dataset.state_scale, dataset.change_scale, state.delta)
 
 
-def learn(config: OptionsConfig, experience: Experience, key: Key[Array, ""]) -> tuple[OptionModel, dict[str, Array]]:
+def learn(
+    config: OptionsConfig, experience: Experience | Sequence[Experience], key: Key[Array, ""]
+) -> tuple[OptionModel, dict[str, Array]]:
     """Learn an option model from experience [T, B, ...]; pure, so experiences and keys may be vmapped.
 
-    Returns the model and the losses of every step, leading axis the step.
+    Several experiences, of tasks that share the body, are merged. Returns the model and the losses of every step,
+    leading axis the step.
+
+    Raises:
+      ShortExperienceError: delta is a quantile, and there is no experience long enough to hold a part of it out.
     """
     config = as_arrays(config)
-    num_envs, state_size = experience.obs.shape[1:]
-    networks = make_networks(config, state_size, experience.action.shape[-1])
     dataset = make_dataset(experience, config)
-    one = partial(step, config, networks, dataset, num_envs)
-    state, losses = jax.lax.scan(lambda s, _: one(s), init(config, networks, key), None, config.steps)
+    rows = dataset.experience
+    networks = make_networks(config, rows.obs.shape[-1], rows.action.shape[-1])
+    state = init(config, networks, key)
+    state, losses = jax.lax.scan(lambda s, _: step(config, networks, dataset, s), state, None, config.steps)
     return as_model(state, dataset), losses

@@ -5,6 +5,7 @@ from typing import Any
 import distrax
 import jax
 import jax.numpy as jnp
+import optax
 from jaxtyping import Array, Bool, Float
 
 from taic_jax.types import Scalar
@@ -36,6 +37,13 @@ def adversarial_loss(
 ) -> Float[Array, ""]:
     """L_adv (eq. 9): F's mean squared error on normalised start and end state."""
     return jnp.mean(jnp.square(estimated - jnp.stack([start, end])))
+
+
+def end_loss(end_logit: Float[Array, " L"], mask: Bool[Array, " L"]) -> Float[Array, ""]:
+    """Cross-entropy of the end signal c_t (§3.4.2): yes at the window's last action, no at those before it."""
+    is_last = mask & ~jnp.append(mask[1:], False)
+    errors = optax.sigmoid_binary_cross_entropy(end_logit, is_last.astype(jnp.float32))
+    return jnp.sum(jnp.where(mask, errors, 0.0)) / jnp.sum(mask, dtype=jnp.float32)
 
 
 @jax.custom_vjp

@@ -1,7 +1,7 @@
 """The four networks of the option model: E, D, P, F (figure 2). Unbatched; the caller vmaps."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import flax.linen as nn
 import jax
@@ -33,18 +33,26 @@ class Encoder(nn.Module):
 
     def __call__(self, actions: Float[Array, "L A"]) -> tuple[Float[Array, "L D"], Float[Array, "L D"]]:
         """Return mean and log-std of q(o|a_0..a_i) for each i."""
-        outputs = self.rnn(actions, initial_carry=self.start())
-        mean, log_std = jnp.split(self.head(outputs), 2, axis=-1)
-        # Bounded, so that neither KL nor samples can overflow early in training.
-        return mean, jnp.clip(log_std, -6.0, 2.0)
+        outputs: Any = self.rnn(actions, initial_carry=self.start())
+        return self._split(outputs)
 
     def start(self) -> Carry:
         """Return the carry before the first action."""
         return jnp.zeros(self.hidden_size), jnp.zeros(self.hidden_size)
 
+    def step(self, carry: Carry, action: Float[Array, " A"]) -> tuple[Carry, tuple[Array, Array]]:
+        """Return the next carry, and mean and log-std [D] of q(o|a_0..a_i) for the action a_i."""
+        carry, output = self.cell(carry, action)
+        return carry, self._split(output)
 
-class Decoder(nn.Module):
-    """D: o -> actions and end logits, one tick at a time; open loop, so it never looks at the state."""
+    def _split(self, outputs: Float[Array, "*batch H"]) -> tuple[Array, Array]:
+        mean, log_std = jnp.split(self.head(outputs), 2, axis=-1)
+        # Bounded, so that neither KL nor samples can overflow early in training.
+        return mean, jnp.clip(log_std, -6.0, 2.0)
+
+
+class OpenDecoder(nn.Module):
+    """D in open loop: o -> actions and end logits, one tick at a time, never looking at the state (§3.2)."""
 
     action_size: int
     hidden_size: int
@@ -60,16 +68,53 @@ class Decoder(nn.Module):
         memory, hidden = jnp.split(nn.tanh(self.first(option)), 2)
         return memory, hidden
 
-    def step(self, carry: Carry, option: Float[Array, " D"]) -> tuple[Carry, tuple[Array, Array]]:
+    def step(
+        self, carry: Carry, option: Float[Array, " D"], state: Float[Array, " P"]
+    ) -> tuple[Carry, tuple[Array, Array]]:
         """Return the next carry, the action [A] and the logit that it is the last one []."""
         carry, output = self.cell(carry, option)
         output = self.head(output)
         return carry, (output[:-1], output[-1])
 
-    def __call__(self, option: Float[Array, " D"], length: int) -> tuple[Float[Array, "L A"], Float[Array, " L"]]:
-        """Return the `length` actions and end logits that as many steps give."""
-        inputs = jnp.broadcast_to(option, (length, *option.shape))
+    def __call__(
+        self, option: Float[Array, " D"], states: Float[Array, "L P"]
+    ) -> tuple[Float[Array, "L A"], Float[Array, " L"]]:
+        """Return the actions and end logits that L steps give."""
+        inputs = jnp.broadcast_to(option, (len(states), *option.shape))
         outputs = self.head(self.rnn(inputs, initial_carry=self.start(option)))
+        return outputs[:, :-1], outputs[:, -1]
+
+
+class ClosedDecoder(nn.Module):
+    """D in closed loop: pi(a|o, s) and the end logit, from the normalised state of each tick (§4.2.2, §5).
+
+    The carry counts the ticks, as a share of the longest option: without it an end signal could not tell time.
+    """
+
+    action_size: int
+    hidden_sizes: Sequence[int]
+    length: int
+
+    def setup(self) -> None:
+        self.mlp = MLP((*self.hidden_sizes, self.action_size + 1))
+
+    def start(self, option: Float[Array, " D"]) -> Float[Array, ""]:
+        """Return the share of ticks run: none."""
+        return jnp.zeros(())
+
+    def step(
+        self, carry: Float[Array, ""], option: Float[Array, " D"], state: Float[Array, " P"]
+    ) -> tuple[Array, tuple[Array, Array]]:
+        """Return the next carry, the action [A] and the logit that it is the last one []."""
+        output = self.mlp(jnp.concatenate([state, option, carry[None]]))
+        return carry + 1.0 / self.length, (output[:-1], output[-1])
+
+    def __call__(
+        self, option: Float[Array, " D"], states: Float[Array, "L P"]
+    ) -> tuple[Float[Array, "L A"], Float[Array, " L"]]:
+        """Return the actions and end logits that L steps through these states give."""
+        ticks = jnp.arange(len(states), dtype=jnp.float32)[:, None] / self.length
+        outputs = self.mlp(jnp.hstack([states, jnp.broadcast_to(option, (len(states), *option.shape)), ticks]))
         return outputs[:, :-1], outputs[:, -1]
 
 
@@ -101,7 +146,7 @@ class Networks(NamedTuple):
     """The modules; their parameters are in `OptionModel.params` under the same names."""
 
     encoder: Encoder
-    decoder: Decoder
+    decoder: OpenDecoder | ClosedDecoder
     predictor: Predictor
     estimator: StateEstimator
 
@@ -119,18 +164,26 @@ class Scale(struct.PyTreeNode):
 
 
 class OptionModel(struct.PyTreeNode):
-    """What `learn` makes and `train` uses: parameters, and the scales of states and state changes."""
+    """What `learn` makes and `train` uses: parameters, the scales of states and state changes, and delta [].
+
+    `delta` is the error of P at which termination predict ends an option.
+    """
 
     params: dict
     state_scale: Scale
     change_scale: Scale
+    delta: Array
 
 
 def make_networks(config: OptionsConfig, state_size: int, action_size: int) -> Networks:
     """Return the modules for states [P] and actions [A]."""
+    if config.decoder == "closed":
+        decoder = ClosedDecoder(action_size, tuple(config.decoder_sizes), config.length)
+    else:
+        decoder = OpenDecoder(action_size, config.hidden_size)
     return Networks(
         Encoder(config.size, config.hidden_size),
-        Decoder(action_size, config.hidden_size),
+        decoder,
         Predictor(state_size, tuple(config.mlp_sizes)),
         StateEstimator(state_size, tuple(config.mlp_sizes)),
     )
@@ -143,7 +196,7 @@ def init_params(networks: Networks, config: OptionsConfig, key: Key[Array, ""]) 
     state, option = jnp.zeros(networks.predictor.state_size), jnp.zeros(config.size)
     return {
         "encoder": networks.encoder.init(key_e, actions),
-        "decoder": networks.decoder.init(key_d, option, config.length),
+        "decoder": networks.decoder.init(key_d, option, jnp.zeros((config.length, len(state)))),
         "predictor": networks.predictor.init(key_p, state, option),
         "estimator": networks.estimator.init(key_f, option),
     }

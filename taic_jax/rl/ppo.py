@@ -19,7 +19,7 @@ from taic_jax.envs.wrappers import AutoReset
 from taic_jax.networks import Policy, PolicyParams
 from taic_jax.options.execution import Executor
 from taic_jax.returns import semi_markov_advantages
-from taic_jax.rl.rollout import DecideFn, Rollout, Running, rollout, start
+from taic_jax.rl.rollout import DecideFn, Rollout, Running, count_durations, rollout, start
 from taic_jax.types import Scalar, as_arrays
 
 LOSSES = ("policy_loss", "value_loss", "entropy", "approx_kl", "clip_fraction")
@@ -254,11 +254,11 @@ def iterate(
         key=key,
         iteration=state.iteration + 1,
     )
-    return state, _metrics(config, state, ticks, result), ticks
+    return state, _metrics(config, state, ticks, result, executor.length), ticks
 
 
-def _metrics(config: PPOConfig, state: TrainState, ticks: Rollout, result: _Update) -> dict[str, Array]:
-    """Return the scalars of one iteration."""
+def _metrics(config: PPOConfig, state: TrainState, ticks: Rollout, result: _Update, length: int) -> dict[str, Array]:
+    """Return the scalars of one iteration and, where options take more than one tick, their durations [L]."""
     count = jnp.sum(ticks.decision, dtype=jnp.int32)
     num_updates = config.epochs * ((count + config.minibatch_size - 1) // config.minibatch_size)
     terms = dict(zip(LOSSES, result.terms / num_updates.astype(jnp.float32), strict=True))
@@ -269,6 +269,7 @@ def _metrics(config: PPOConfig, state: TrainState, ticks: Rollout, result: _Upda
         "duration": ticks.decision.size / count.astype(jnp.float32),
         "std": jnp.mean(jnp.exp(state.params.log_std)),
         **terms,
+        **({"durations": count_durations(ticks, length)} if length > 1 else {}),
     }
 
 

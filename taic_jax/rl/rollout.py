@@ -26,13 +26,17 @@ class Running(struct.PyTreeNode):
 
     env: State
     option: Any
+    duration: Array
     ended: Array
     episode_return: Array
     last_return: Array
 
 
 class Rollout(struct.PyTreeNode):
-    """T ticks of B environments; `option` and `log_prob` mean something only where `decision`."""
+    """T ticks of B environments; `option` and `log_prob` mean something only where `decision`.
+
+    `duration` counts the ticks that the running option has taken, this one included.
+    """
 
     obs: Array
     option: Array
@@ -41,6 +45,7 @@ class Rollout(struct.PyTreeNode):
     action: Array
     reward: Array
     ended: Array
+    duration: Array
     terminated: Array
     truncated: Array
     final_obs: Array
@@ -52,8 +57,8 @@ def start(env: Env, executor: Executor, num_envs: int, key: Key[Array, ""]) -> R
     """Reset `num_envs` environments; every one of them decides at its first tick."""
     state = jax.vmap(env.reset)(jax.random.split(key, num_envs))
     options = jax.vmap(executor.start)(jnp.zeros((num_envs, executor.option_size)), state.obs)
-    zeros = jnp.zeros(num_envs)
-    return Running(state, options, jnp.ones(num_envs, bool), zeros, jnp.full(num_envs, jnp.nan, jnp.float32))
+    zeros, never = jnp.zeros(num_envs), jnp.full(num_envs, jnp.nan, jnp.float32)
+    return Running(state, options, jnp.zeros(num_envs, jnp.int32), jnp.ones(num_envs, bool), zeros, never)
 
 
 def _tick(
@@ -62,27 +67,37 @@ def _tick(
     decide: DecideFn,
     keep: Callable[[State], Any],
     running: Running,
-    noise: Float[Array, "B D"],
+    noise: Float[Array, "B Z"],
 ) -> tuple[Running, Rollout]:
     obs, decision = running.env.obs, running.ended
-    option, log_prob = decide(obs, noise)
+    option, log_prob = decide(obs, noise[:, : executor.option_size])
     fresh = jax.vmap(executor.start)(option, obs)
     carry, action = jax.vmap(executor.act)(select(decision, fresh, running.option), obs)
     state: Any = jax.vmap(env.step)(running.env, action)
     done = state.terminated | state.truncated
-    ended = jax.vmap(executor.ended)(carry, state.final_obs) | done
+    duration = jnp.where(decision, 0, running.duration) + 1
+    ended = jax.vmap(executor.ended)(carry, state.final_obs, noise[:, executor.option_size :])
+    ended = ended | (duration >= executor.length) | done
     total = running.episode_return + state.reward
     tick = Rollout(
         obs=obs, option=option, log_prob=log_prob, decision=decision, action=action, reward=state.reward,
-        ended=ended, terminated=state.terminated, truncated=state.truncated, final_obs=state.final_obs,
-        episode_return=total, extras=keep(state),
+        ended=ended, duration=duration, terminated=state.terminated, truncated=state.truncated,
+        final_obs=state.final_obs, episode_return=total, extras=keep(state),
     )  # fmt: skip
     last_return = jnp.where(done, total, running.last_return)
-    return Running(state, carry, ended, jnp.where(done, 0.0, total), last_return), tick
+    return Running(state, carry, duration, ended, jnp.where(done, 0.0, total), last_return), tick
 
 
 def nothing(state: State) -> None:
     """Keep no extras of a tick."""
+
+
+def count_durations(ticks: Rollout, length: int, where: Array | bool = True) -> Float[Array, " L"]:
+    """Return how many options ended after 1, 2, ... `length` ticks, among the ticks [T, B] where asked."""
+    ended = ticks.ended & where
+    with jax.numpy_rank_promotion("allow"):
+        counts = ended[..., None] & (ticks.duration[..., None] == jnp.arange(1, length + 1))
+    return jnp.sum(counts, axis=(0, 1)).astype(jnp.float32)
 
 
 def rollout(
@@ -106,5 +121,5 @@ def rollout(
       keep: what else to record of the state after each tick (before a reset: reward and metrics only).
     """
     num_envs = running.ended.shape[0]
-    noise = jax.random.normal(key, (length, num_envs, executor.option_size))
+    noise = jax.random.normal(key, (length, num_envs, executor.option_size + executor.noise_size))
     return jax.lax.scan(partial(_tick, env, executor, decide, keep), running, noise)

@@ -1,0 +1,152 @@
+"""Termination rules beta(s, o): when a running option ends before the longest it may take (§3.4).
+
+A rule is what the executor asks after every tick. What it must remember of the running option is its `memory`.
+"""
+
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int
+
+from taic_jax.config import OptionsConfig
+from taic_jax.networks import apply
+from taic_jax.options.losses import prediction_loss
+from taic_jax.options.model import Carry, Networks, OptionModel
+from taic_jax.types import Scalar
+
+
+def stop_index(errors: Float[Array, " L"], delta: Scalar) -> Int[Array, ""]:
+    """Return the index of the action at which Algorithm 1 stops a window: the first whose error reaches delta.
+
+    That action still belongs to the option. Where no error reaches delta it is the last one.
+    """
+    surprised = errors >= delta
+    return jnp.where(jnp.any(surprised), jnp.argmax(surprised), len(errors) - 1).astype(jnp.int32)
+
+
+def prefix_errors(
+    networks: Networks, model: OptionModel, options: Float[Array, "L D"], states: Float[Array, "L+1 P"]
+) -> Float[Array, " L"]:
+    """Return L_pred of every prefix of a window: the error of P(s_0, o_i) on s_{i+1} (Algorithm 1, lines 3-5)."""
+    start = model.state_scale(states[0])
+    predicted = jax.vmap(lambda o: apply(networks.predictor, model.params["predictor"], start, o))(options)
+    return jax.vmap(prediction_loss)(predicted, model.change_scale(states[1:] - states[:1]))
+
+
+@runtime_checkable
+class Termination(Protocol):
+    """Decide whether an option ends, unbatched; `noise` [X], standard normal, is its chance."""
+
+    @property
+    def noise_size(self) -> int:
+        """X."""
+        ...
+
+    def start(self, networks: Networks, model: OptionModel, state: Float[Array, " P"]) -> Any:
+        """Return the memory of an option that begins in this state."""
+        ...
+
+    def follow(
+        self, networks: Networks, model: OptionModel, memory: Any, action: Float[Array, " A"], end_logit: Array
+    ) -> Any:
+        """Return the memory after D emitted an action and an end logit."""
+        ...
+
+    def ended(
+        self, networks: Networks, model: OptionModel, memory: Any, state: Float[Array, " P"], noise: Array
+    ) -> Bool[Array, ""]:
+        """Return whether the option ends in the state after the tick."""
+        ...
+
+
+@dataclass(frozen=True)
+class Fixed:
+    """Fix-len (§3.4.1): every option takes all its ticks."""
+
+    noise_size: int = 0
+
+    def start(self, networks: Networks, model: OptionModel, state: Float[Array, " P"]) -> None:
+        """Remember nothing."""
+
+    def follow(
+        self, networks: Networks, model: OptionModel, memory: None, action: Float[Array, " A"], end_logit: Array
+    ) -> None:
+        """Remember nothing."""
+
+    def ended(
+        self, networks: Networks, model: OptionModel, memory: None, state: Float[Array, " P"], noise: Array
+    ) -> Bool[Array, ""]:
+        """Never end early."""
+        return jnp.zeros((), bool)
+
+
+@dataclass(frozen=True)
+class Output:
+    """Term-output (§3.4.2): D's end signal ends the option; the memory is its last logit.
+
+    With `noise_size` 1 the signal is a probability that the noise draws from; with 0 it is yes above one half.
+    """
+
+    noise_size: int
+
+    def start(self, networks: Networks, model: OptionModel, state: Float[Array, " P"]) -> Float[Array, ""]:
+        """Remember no signal yet."""
+        return jnp.zeros(())
+
+    def follow(
+        self, networks: Networks, model: OptionModel, memory: Array, action: Float[Array, " A"], end_logit: Array
+    ) -> Float[Array, ""]:
+        """Remember the logit."""
+        return end_logit
+
+    def ended(
+        self, networks: Networks, model: OptionModel, memory: Array, state: Float[Array, " P"], noise: Array
+    ) -> Bool[Array, ""]:
+        """End with the signal's probability, or where it is above one half."""
+        if not self.noise_size:
+            return memory > 0.0
+        return jax.scipy.special.ndtr(noise[0]) < jax.nn.sigmoid(memory)
+
+
+class Following(struct.PyTreeNode):
+    """What termination predict remembers: the option's first state, E's carry, and the option E sees so far."""
+
+    start: Array
+    carry: Carry
+    option: Array
+
+
+@dataclass(frozen=True)
+class Predict:
+    """Term-predict (§3.4.3): E follows the executed actions, and a surprised P ends the option."""
+
+    noise_size: int = 0
+
+    def start(self, networks: Networks, model: OptionModel, state: Float[Array, " P"]) -> Following:
+        """Remember the state the option began in."""
+        return Following(state, networks.encoder.start(), jnp.zeros(networks.encoder.option_size))
+
+    def follow(
+        self, networks: Networks, model: OptionModel, memory: Following, action: Float[Array, " A"], end_logit: Array
+    ) -> Following:
+        """Let E read the action."""
+        params = model.params["encoder"]
+        carry, (option, _) = apply(networks.encoder, params, memory.carry, action, method="step")
+        return memory.replace(carry=carry, option=option)
+
+    def ended(
+        self, networks: Networks, model: OptionModel, memory: Following, state: Float[Array, " P"], noise: Array
+    ) -> Bool[Array, ""]:
+        """End where the error of P(s_0, o_i) on the state reached is at least delta."""
+        states = jnp.stack([memory.start, state])
+        return prefix_errors(networks, model, memory.option[None], states)[0] >= model.delta
+
+
+def make_termination(config: OptionsConfig) -> Termination:
+    """Return the config's rule."""
+    if config.termination == "predict":
+        return Predict()
+    return Output(int(config.end_signal == "sampled")) if config.termination == "output" else Fixed()
