@@ -149,6 +149,20 @@ class OptionsConfig:
 
 
 @dataclass(frozen=True)
+class FineTuneConfig:
+    """Fine-tuning of D by PPO on its actions, in turns with the policy over options; off unless every is set."""
+
+    every: int = 0
+    """Iterations of the policy between two of D; 0 leaves D as it was learnt."""
+    learning_rate: float = 1e-4
+    """Step size of Adam for D."""
+    std: float = 0.1
+    """Standard deviation of the noise on D's actions in its own iterations."""
+    kl_weight: float = 1.0
+    """Weight of the divergence from the D that was learnt."""
+
+
+@dataclass(frozen=True)
 class TrainConfig:
     """Stage train: the policy that acts by choosing options (section 3.5)."""
 
@@ -158,6 +172,7 @@ class TrainConfig:
     """Flat PPO beside it: on the task alone; each action held for options.length ticks; given the ticks of collect
     as well; or starting from the flat policy of the run that options.source names."""
     ppo: PPOConfig = PPOConfig(log_std_init=0.0)
+    fine_tune: FineTuneConfig = FineTuneConfig()
 
 
 @dataclass(frozen=True)
@@ -185,7 +200,9 @@ class Config:
     """Independent repeats, trained side by side in one program."""
 
 
-CONFIG_CLASSES = (EnvConfig, PPOConfig, CollectConfig, OptionsConfig, TrainConfig, EvaluateConfig, Config)
+CONFIG_CLASSES = (
+    EnvConfig, PPOConfig, CollectConfig, OptionsConfig, FineTuneConfig, TrainConfig, EvaluateConfig, Config,
+)  # fmt: skip
 
 # Closed intervals by field name. Other integers are at least 1, other floats at least 0.
 TINY = 1e-6
@@ -198,6 +215,8 @@ BOUNDS: dict[str, tuple[float, float]] = {
     "video_ticks": (0, math.inf),
     "clip": (TINY, math.inf),
     "delta": (TINY, math.inf),
+    "every": (0, math.inf),
+    "std": (TINY, math.inf),
     "fraction": (TINY, 1),
     "gamma": (0, 1),
     "lambda_": (0, 1),

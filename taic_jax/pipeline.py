@@ -5,31 +5,28 @@ import json
 import shutil
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
 
 from taic_jax.artifacts import OPTIONS, POLICY, describe, load_options, load_policy, save_options, save_policy
-from taic_jax.config import COLLECT, Config, ConfigError, PPOConfig, collector_is_baseline, needs_collect
+from taic_jax.config import COLLECT, Config, ConfigError, collector_is_baseline, needs_collect
 from taic_jax.config_io import to_yaml
 from taic_jax.envs import environment_options, make_env
 from taic_jax.envs.base import Env
 from taic_jax.envs.errors import RenderingError
-from taic_jax.evaluate import evaluate
-from taic_jax.experience import EXPERIENCE, ExperienceStore, as_experience, gather_experience, num_blocks
+from taic_jax.experience import EXPERIENCE, ExperienceStore, gather_experience, num_blocks
+from taic_jax.level import FineTunedLevel, Level, Trained
 from taic_jax.logging import RunLogger
 from taic_jax.networks import PolicyParams
 from taic_jax.normalize import Statistics
 from taic_jax.options import learning
 from taic_jax.options.dataset import Experience, make_dataset
-from taic_jax.options.execution import Executor, IdentityExecutor, make_executor
+from taic_jax.options.execution import IdentityExecutor, make_executor
 from taic_jax.options.model import OptionModel, make_networks
-from taic_jax.rl import ppo
 from taic_jax.stage import CLOCK, Clock, Run, drive
 from taic_jax.summary import as_summary, write_video
 from taic_jax.types import as_arrays
@@ -39,54 +36,6 @@ STEPS_PER_LOG = 100
 
 class RunFolderError(ValueError):
     """The run folder cannot be used as asked."""
-
-
-@dataclass(frozen=True)
-class Level:
-    """Control of one task at one level, for one seed: the methods are vmapped over keys, states and models.
-
-    `executor_of` takes the option model, or nothing where options are actions.
-    """
-
-    env: Env
-    config: PPOConfig
-    ticks: int
-    episodes: int
-    executor_of: Callable[..., Executor]
-
-    @property
-    def iterations(self) -> int:
-        """How many iterations the budget buys."""
-        return ppo.num_iterations(self.config, self.ticks)
-
-    def init(self, key: Array, *model: OptionModel) -> ppo.TrainState:
-        """Return the state of an untrained policy."""
-        return ppo.init(self.config, self.env, self.executor_of(*model), key)
-
-    def step(self, state: ppo.TrainState, *model: OptionModel) -> tuple[ppo.TrainState, dict, Experience]:
-        """Run one iteration; return its metrics and its experience."""
-        executor = self.executor_of(*model)
-        state, metrics, rollout = ppo.iterate(self.config, self.env, executor, self.iterations, state)
-        return state, metrics, as_experience(rollout, self.env.proprioceptive_size)
-
-    def assess(self, key: Array, state: ppo.TrainState, *model: OptionModel) -> dict[str, dict[str, Array]]:
-        """Evaluate the policy as it explores, and taking its mean options."""
-        both = partial(evaluate, self.env, self.agent(state, *model), key, self.episodes)
-        results = jax.vmap(both)(jnp.array([1.0, 0.0]))
-        modes = ("return", "return_mean_option")
-        return {mode: jax.tree.map(lambda x, i=i: x[i], results) for i, mode in enumerate(modes)}
-
-    def agent(self, state: ppo.TrainState, *model: OptionModel) -> ppo.Agent:
-        """Return what acts."""
-        return ppo.as_agent(self.config, self.executor_of(*model), state)
-
-
-class Trained(NamedTuple):
-    """What training one policy per seed gives, leading axis K."""
-
-    agent: ppo.Agent
-    first: dict[str, dict[str, Array]]  # evaluation of the untrained policy
-    last: dict[str, dict[str, Array]]
 
 
 def run_pipeline(config: Config, run_dir: Path, *, resume: bool = False, overwrite: bool = False) -> dict:
@@ -189,10 +138,9 @@ def _train(
     keys = run.stage_keys("evaluate")
     assess = run.compile(jax.vmap(level.assess), keys, state, *model)
     first = jax.device_get(assess(keys, state, *model))
-    unit = level.config.num_envs * level.config.rollout_length
     state = drive(
         run, stage, jax.vmap(level.step), state, *model,
-        num_steps=level.iterations, unit=unit, ticks=unit * len(keys), after=after,
+        num_steps=level.num_steps, unit=level.unit, ticks=level.unit * len(keys), after=after,
     )  # fmt: skip
     last = jax.device_get(assess(keys, state, *model))
     run.logger.log("evaluate", level.ticks, {f"{stage}/{name}": x["return"] for name, x in last.items()})
@@ -245,12 +193,17 @@ def frozen_options(run: Run, env: Env) -> OptionModel:
 
 
 def train_over_options(run: Run, env: Env, model: OptionModel) -> Trained:
-    """Train the policy that acts by choosing options."""
+    """Train the policy that acts by choosing options; a fine-tuned D is saved as the artifact `options_fine_tuned`."""
     config = run.config
     executor_of = partial(make_executor, config.options, env.action_size)
-    return _train(
-        run, "train", Level(env, config.train.ppo, config.train.ticks, config.evaluate.episodes, executor_of), model
-    )
+    level = Level(env, config.train.ppo, config.train.ticks, config.evaluate.episodes, executor_of)
+    if not config.train.fine_tune.every:
+        return _train(run, "train", level, model)
+    level = FineTunedLevel(**vars(level), fine_tune=config.train.fine_tune)
+    trained = _train(run, "train", level, model)
+    executor: Any = trained.agent.executor
+    save_options(run.dir / "options_fine_tuned", executor.model, env, config.options)
+    return trained
 
 
 def train_baseline(run: Run, env: Env, name: str) -> Trained:

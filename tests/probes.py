@@ -138,7 +138,7 @@ class Repeat(struct.PyTreeNode):
         """Carry the action."""
         return option
 
-    def act(self, carry: Array, obs: Array) -> tuple[Array, Array]:
+    def act(self, carry: Array, obs: Array, noise: Array) -> tuple[Array, Array]:
         """Emit the action, clipped to its bounds."""
         return carry, jnp.clip(carry, -1.0, 1.0)
 

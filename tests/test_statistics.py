@@ -3,9 +3,10 @@
 import math
 
 import numpy as np
+import pytest
 from scipy import stats
 
-from taic_jax.statistics import bootstrap_interval, iqm, summarize
+from taic_jax.statistics import bootstrap_interval, iqm, probability_of_improvement, summarize
 
 
 def test_iqm_drops_the_lowest_and_highest_quarter():
@@ -62,3 +63,11 @@ def test_summary_is_json():
         "ci95": [None, None],
     }
     assert summarize([1.0, math.nan])["per_seed"] == [1, None]
+
+
+def test_probability_of_improvement_by_hand():
+    # Of nine pairs, 1 beats 0, 3 beats all three, 2 beats two and ties with 2: (1 + 3 + 2 + 1/2) / 9.
+    share, (low, high) = probability_of_improvement([1, 3, 2], [0, 2, 1.5])
+    assert share == pytest.approx((1 + 3 + 2 + 0.5) / 9) and low < share < high
+    assert probability_of_improvement([2, 3], [0, 1]) == (1.0, (1.0, 1.0))
+    assert probability_of_improvement([1, 1], [1, 1])[0] == 0.5

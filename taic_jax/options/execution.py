@@ -28,14 +28,14 @@ class Executor(Protocol):
 
     @property
     def noise_size(self) -> int:
-        """How many standard normal numbers the termination rule takes each tick."""
+        """X, how many standard normal numbers `act` and `ended` share each tick."""
         ...
 
     def start(self, option: Float[Array, " D"], obs: Float[Array, " S"]) -> Any:
         """Return the carry of an option that begins at this observation."""
         ...
 
-    def act(self, carry: Any, obs: Float[Array, " S"]) -> tuple[Any, Float[Array, " A"]]:
+    def act(self, carry: Any, obs: Float[Array, " S"], noise: Float[Array, " X"]) -> tuple[Any, Float[Array, " A"]]:
         """Return the next carry and the action, each entry in [-1, 1]."""
         ...
 
@@ -55,7 +55,7 @@ class IdentityExecutor(struct.PyTreeNode):
         """Carry the action itself."""
         return option
 
-    def act(self, carry: Float[Array, " A"], obs: Float[Array, " S"]) -> tuple[Array, Array]:
+    def act(self, carry: Float[Array, " A"], obs: Float[Array, " S"], noise: Array) -> tuple[Array, Array]:
         """Emit the action, clipped to its bounds."""
         return carry, jnp.clip(carry, -1.0, 1.0)
 
@@ -95,12 +95,14 @@ class OptionExecutor(struct.PyTreeNode):
         carry = apply(self.networks.decoder, self.model.params["decoder"], option, method="start")
         return Decoding(option, carry, self.termination.start(self.networks, self.model, self._state(obs)))
 
-    def act(self, carry: Decoding, obs: Float[Array, " S"]) -> tuple[Decoding, Float[Array, " A"]]:
-        """Emit D's next action, clipped to its bounds."""
+    def act(
+        self, carry: Decoding, obs: Float[Array, " S"], noise: Array, disturbance: Array | float = 0.0
+    ) -> tuple[Decoding, Float[Array, " A"]]:
+        """Emit D's next action, disturbed if so asked, clipped to its bounds."""
         params, state = self.model.params["decoder"], self.model.state_scale(self._state(obs))
         step = apply(self.networks.decoder, params, carry.carry, carry.option, state, method="step")
         memory, (action, end_logit) = step
-        action = jnp.clip(action, -1.0, 1.0)
+        action = jnp.clip(action + disturbance, -1.0, 1.0)
         followed = self.termination.follow(self.networks, self.model, carry.memory, action, end_logit)
         return Decoding(carry.option, memory, followed), action
 

@@ -70,13 +70,14 @@ def _tick(
     noise: Float[Array, "B Z"],
 ) -> tuple[Running, Rollout]:
     obs, decision = running.env.obs, running.ended
+    chance = noise[:, executor.option_size :]
     option, log_prob = decide(obs, noise[:, : executor.option_size])
     fresh = jax.vmap(executor.start)(option, obs)
-    carry, action = jax.vmap(executor.act)(select(decision, fresh, running.option), obs)
+    carry, action = jax.vmap(executor.act)(select(decision, fresh, running.option), obs, chance)
     state: Any = jax.vmap(env.step)(running.env, action)
     done = state.terminated | state.truncated
     duration = jnp.where(decision, 0, running.duration) + 1
-    ended = jax.vmap(executor.ended)(carry, state.final_obs, noise[:, executor.option_size :])
+    ended = jax.vmap(executor.ended)(carry, state.final_obs, chance)
     ended = ended | (duration >= executor.length) | done
     total = running.episode_return + state.reward
     tick = Rollout(

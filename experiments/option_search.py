@@ -1,0 +1,156 @@
+"""Search option settings with one vmapped program: every point of a grid of leaf fields, for every seed at once.
+
+python -m taic_jax.experiments.option_search half_cheetah --experience RUN --options.decoder closed \
+    --grid options.lambda_kl=0.003,0.01 train.ppo.learning_rate=3e-4,1e-3
+
+Learns options from a run's experience at each point, trains over them for --train.ticks, and appends a row per point.
+"""
+
+import csv
+import dataclasses
+import itertools
+import sys
+import time
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+
+from taic_jax.config import Config, ConfigError, validate, walk
+from taic_jax.config_io import closest, load_config
+from taic_jax.envs.base import Env
+from taic_jax.evaluate import evaluate
+from taic_jax.experience import gather_experience
+from taic_jax.options.dataset import Experience
+from taic_jax.options.execution import make_executor
+from taic_jax.options.learning import learn
+from taic_jax.pipeline import make_envs
+from taic_jax.rl import ppo
+from taic_jax.summary import commit
+from taic_jax.types import as_arrays
+
+FIELDS = (
+    "task", "point", "seeds", "ticks", "untrained", "return", "mean_option", "duration", "kl_loss",
+    "reconstruction_loss", "prediction_loss", "seconds", "commit",
+)  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+    """Try every point of a grid of option settings."""
+
+    preset: tyro.conf.Positional[str]
+    """Preset or file to start from."""
+    experience: Path
+    """Run whose experience options are learnt from."""
+    grid: tuple[str, ...] = ()
+    """Leaf fields with their values, as in options.lambda_kl=0.003,0.01; every combination is tried."""
+    out: Path = Path("experiments/results/option_search.csv")
+    """The table."""
+    config: Annotated[Config, tyro.conf.arg(name=""), tyro.conf.FlagConversionOff] = Config()
+
+
+def parse_grid(grid: Sequence[str]) -> dict[str, list[float]]:
+    """Return the values of each named leaf.
+
+    Raises:
+      ConfigError: a name is no leaf field, or a value is no number.
+    """
+    leaves = [name for name, value in walk(Config()) if type(value) is float]
+    result = {}
+    for axis in grid:
+        name, _, values = axis.partition("=")
+        if name not in leaves:
+            raise ConfigError(f"--grid: expected a leaf field, got {name!r}; the nearest is {closest(name, leaves)}")
+        try:
+            result[name] = [float(value) for value in values.split(",")]
+        except ValueError:
+            raise ConfigError(f"--grid {name}: expected numbers with commas between, got {values!r}") from None
+    return result
+
+
+def replace(config: Any, name: str, value: Any) -> Any:
+    """Replace the field of this dotted name."""
+    first, _, rest = name.partition(".")
+    return dataclasses.replace(config, **{first: replace(getattr(config, first), rest, value) if rest else value})
+
+
+def score(env: Env, config: Config, experience: Experience, key: jax.Array) -> dict[str, jax.Array]:
+    """Learn options, train over them, and return what came out, of one point and seed."""
+    key_learn, key_train, key_evaluate = jax.random.split(key, 3)
+    model, losses = learn(config.options, experience, key_learn)
+    executor = make_executor(config.options, env.action_size, model)
+    first = ppo.as_agent(config.train.ppo, executor, ppo.init(config.train.ppo, env, executor, key_train))
+    agent, metrics = ppo.train(config.train.ppo, env, executor, key_train, config.train.ticks)
+    told = partial(evaluate, env, key=key_evaluate, episodes=config.evaluate.episodes)
+    return {
+        "untrained": told(first)["return"],
+        "return": told(agent)["return"],
+        "mean_option": told(agent, exploration=0.0)["return"],
+        "duration": metrics["duration"][-1],
+        **{name: jnp.mean(losses[name][-50:]) for name in ("kl_loss", "reconstruction_loss", "prediction_loss")},
+    }
+
+
+def search(arguments: Arguments, config: Config) -> list[dict[str, Any]]:
+    """Return a row per point of the grid."""
+    started = time.time()
+    env, _ = make_envs(config)
+    grid = parse_grid(arguments.grid)
+    points = list(itertools.product(*grid.values()))
+    swept, axes = as_arrays(config), jax.tree.map(lambda _: None, as_arrays(config))
+    for i, name in enumerate(grid):
+        swept = replace(swept, name, jnp.array([point[i] for point in points], jnp.float32))
+        axes = replace(axes, name, 0)
+    experience = jax.tree.map(jnp.asarray, gather_experience(arguments.experience, env, config.seeds))
+    keys = jnp.stack([jax.random.key(config.seed + k) for k in range(config.seeds)])
+    over_seeds = jax.vmap(partial(score, env), in_axes=(None, 0, 0))
+    over_points = jax.vmap(over_seeds, in_axes=(axes, None, None)) if grid else over_seeds
+    scores = jax.device_get(jax.jit(over_points)(swept, experience, keys))
+    seconds = round(time.time() - started)
+    rows = []
+    for i, point in enumerate(points):
+        settings = {**_changes(arguments), **dict(zip(grid, point, strict=True))}
+        row = {
+            "task": config.env.name, "point": " ".join(f"{k}={v}" for k, v in settings.items()),
+            "seeds": config.seeds, "ticks": config.train.ticks, "seconds": seconds, "commit": commit(),
+        }  # fmt: skip
+        for name, values in scores.items():
+            row[name] = " ".join(f"{x:.4g}" for x in np.atleast_1d(values[i] if grid else values))
+        rows.append(row)
+    return rows
+
+
+def _changes(arguments: Arguments) -> dict[str, Any]:
+    """Return what the command line changes in the preset's options and policy."""
+    preset = dict(walk(load_config(arguments.preset)))
+    relevant = ("options.", "train.ppo.")
+    return {k: v for k, v in walk(arguments.config) if k.startswith(relevant) and preset[k] != v}
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Search, append the rows to the table and print them."""
+    args = list(sys.argv[1:] if args is None else args)
+    default = Arguments(args[0], Path(), config=load_config(args[0]))
+    arguments = tyro.cli(Arguments, args=args, default=default)
+    validate(arguments.config)
+    rows = search(arguments, arguments.config)
+    new = not arguments.out.exists()
+    arguments.out.parent.mkdir(parents=True, exist_ok=True)
+    with arguments.out.open("a", newline="") as file:
+        writer = csv.DictWriter(file, FIELDS)
+        if new:
+            writer.writeheader()
+        writer.writerows(rows)
+    for row in rows:
+        numbers = {name: np.mean(np.array(row[name].split(), float)) for name in FIELDS[4:11]}
+        print(row["point"], "|", ", ".join(f"{name} {value:.4g}" for name, value in numbers.items()))
+
+
+if __name__ == "__main__":
+    main()

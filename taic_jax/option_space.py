@@ -1,0 +1,132 @@
+"""What options do when they are executed from chosen states, and how orderly that makes the option space (§4.2.1)."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Float, Key
+
+from taic_jax.config import OptionsConfig
+from taic_jax.envs.base import Env
+from taic_jax.envs.wrappers import AutoReset
+from taic_jax.measures import active_dimensions, kl_per_dimension, measure_option_space
+from taic_jax.networks import apply
+from taic_jax.options.dataset import Experience, gather, make_dataset
+from taic_jax.options.execution import Executor, make_executor
+from taic_jax.options.model import OptionModel, make_networks
+from taic_jax.rl.rollout import rollout, start
+from taic_jax.types import as_arrays
+
+WARM_UP = 100
+"""Ticks of random options before options are executed from many states, so that these are states options lead to."""
+
+
+class Effects(struct.PyTreeNode):
+    """N options, the proprioceptive slices they began and ended in, and the ticks they took."""
+
+    option: Array
+    start: Array
+    end: Array
+    ticks: Array
+
+
+def execute(
+    env: Env, executor: Executor, option: Float[Array, "N D"], key: Key[Array, ""], many: bool = False
+) -> Effects:
+    """Execute each option once, until its termination rule or the episode ends it.
+
+    Args:
+      env: the task, not yet wrapped to reset itself.
+      executor: of these options.
+      option: codes to execute.
+      key: consumed.
+      many: begin each in another state, reached by random options; else all in the same first state.
+    """
+    key_start, key_warm_up, key_noise = jax.random.split(key, 3)
+    env, num_options = AutoReset(env), len(option)
+    begin = start(env, executor, num_options, key_start)
+    if many:
+        begin, _ = rollout(env, executor, _prior, begin, key_warm_up, WARM_UP)
+        begin = begin.replace(ended=jnp.ones_like(begin.ended))
+    else:
+        first = jax.tree.map(lambda x: jnp.broadcast_to(x[:1], x.shape), begin.env.replace(key=None))
+        begin = begin.replace(env=first.replace(key=begin.env.key))
+    chosen = partial(_choose, option)
+    _, ticks = rollout(env, executor, chosen, begin, key_noise, executor.length)
+    last = jnp.argmax(ticks.ended, axis=0)
+    size = env.proprioceptive_size
+    end = jnp.take_along_axis(ticks.final_obs, last[None, :, None], axis=0)[0]
+    return Effects(option, ticks.obs[0, :, :size], end[:, :size], last + 1)
+
+
+def _prior(obs: Float[Array, "B S"], noise: Float[Array, "B D"]) -> tuple[Array, Array]:
+    return noise, jnp.zeros(len(noise))
+
+
+def _choose(option: Float[Array, "B D"], obs: Float[Array, "B S"], noise: Array) -> tuple[Array, Array]:
+    return option, jnp.zeros(len(option))
+
+
+class Encoded(struct.PyTreeNode):
+    """N windows of the experience: mean and log standard deviation of q(o|a), and the states at both ends."""
+
+    mean: Array
+    log_std: Array
+    start: Array
+    end: Array
+
+
+def encode_windows(
+    config: OptionsConfig, model: OptionModel, experience: Experience, key: Key[Array, ""], count: int
+) -> Encoded:
+    """Encode `count` windows drawn from the selection, of `config.length` ticks each."""
+    dataset = make_dataset(experience, config)
+    which = jax.random.randint(key, (count,), 0, dataset.count)
+    windows = gather(dataset, which, jnp.full(count, config.length), config.length)
+    networks = make_networks(config, experience.obs.shape[-1], experience.action.shape[-1])
+    encode = partial(apply, networks.encoder, model.params["encoder"])
+    means, log_stds = jax.vmap(encode)(windows.actions)
+    return Encoded(means[:, -1], log_stds[:, -1], windows.states[:, 0], windows.states[:, -1])
+
+
+def measure(
+    env: Env, config: OptionsConfig, model: OptionModel, experience: Experience, key: Key[Array, ""], count: int = 1000
+) -> dict[str, float]:
+    """Measure one option model: what its options do from one state and from many, drawn from the prior and from data.
+
+    Args:
+      env: the task they are executed in.
+      config: with which the model was learnt.
+      model: of one seed.
+      experience: it was learnt from.
+      key: consumed.
+      count: options of each kind, N.
+
+    Returns:
+      Every measure of `measure_option_space` and the mean duration `ticks` under `prior|data/one|many/NAME`; the
+      measures of the windows with the states they were recorded in under `window/NAME`; and `active_dimensions` and
+      `kl`, in nats, of the windows' codes.
+    """
+    config = as_arrays(config)
+    key_prior, key_windows, key_data, *keys = jax.random.split(key, 7)
+    windows = jax.jit(encode_windows, static_argnums=4)(config, model, experience, key_windows, count)
+    data = windows.mean + jnp.exp(windows.log_std) * jax.random.normal(key_data, windows.mean.shape)
+    prior = jax.random.normal(key_prior, data.shape)
+    executor = make_executor(config, env.action_size, model)
+    run = jax.jit(partial(execute, env), static_argnames="many")
+    mean = np.asarray(windows.mean)
+    kl = kl_per_dimension(mean, np.asarray(windows.log_std))
+    result = {"active_dimensions": float(active_dimensions(mean)), "kl": float(kl.sum())}
+    measured = measure_option_space(*map(np.asarray, (data, windows.start, windows.end)))
+    result |= {f"window/{name}": value for name, value in measured.items()}
+    cases = [(kind, option, many) for kind, option in (("prior", prior), ("data", data)) for many in (False, True)]
+    for (kind, option, many), key_run in zip(cases, keys, strict=True):
+        effects = jax.device_get(run(executor, option, key_run, many=many))
+        measured = measure_option_space(effects.option, effects.start, effects.end)
+        measured["ticks"] = float(effects.ticks.mean())
+        # From one state the start is constant, and the end is the change.
+        told = {name: value for name, value in measured.items() if many or not name.endswith(("/start", "/end"))}
+        result |= {f"{kind}/{'many' if many else 'one'}/{name}": value for name, value in told.items()}
+    return result

@@ -1,0 +1,228 @@
+"""Fine-tuning D: PPO on primitive actions through the decoder, in turns with the policy over options (§5).
+
+In D's own iterations its actions are drawn around its output, so that they have a likelihood that PPO's gradient can
+reach D by; policy, critic, E, P and F stay as they are. A KL term holds D near the one that was learnt.
+"""
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from taic_jax import normalize
+from taic_jax.config import FineTuneConfig, PPOConfig
+from taic_jax.envs.base import Env
+from taic_jax.envs.wrappers import AutoReset
+from taic_jax.networks import apply
+from taic_jax.options.execution import Decoding, OptionExecutor
+from taic_jax.returns import semi_markov_advantages
+from taic_jax.rl import ppo
+from taic_jax.rl.rollout import Rollout, rollout
+from taic_jax.types import Scalar
+
+
+class Tuned(struct.PyTreeNode):
+    """Parameters of the D in use, and the state of its optimiser."""
+
+    decoder: Any
+    optimizer: optax.OptState
+
+
+class NoisyExecutor(struct.PyTreeNode):
+    """An option executor whose actions are drawn from a normal distribution around D's output."""
+
+    inner: OptionExecutor
+    std: Scalar
+
+    @property
+    def option_size(self) -> int:
+        """D."""
+        return self.inner.option_size
+
+    @property
+    def length(self) -> int:
+        """L, the most ticks an option takes."""
+        return self.inner.length
+
+    @property
+    def noise_size(self) -> int:
+        """How many standard normal numbers a tick takes: those of the inner executor, then one per action."""
+        return self.inner.noise_size + self.inner.networks.decoder.action_size
+
+    def start(self, option: Float[Array, " D"], obs: Float[Array, " S"]) -> Decoding:
+        """Start the inner executor."""
+        return self.inner.start(option, obs)
+
+    def act(self, carry: Decoding, obs: Float[Array, " S"], noise: Float[Array, " X"]) -> tuple[Decoding, Array]:
+        """Emit D's next action with noise, clipped to its bounds."""
+        return self.inner.act(carry, obs, noise[: self.inner.noise_size], self.std * noise[self.inner.noise_size :])
+
+    def ended(self, carry: Decoding, obs: Float[Array, " S"], noise: Float[Array, " X"]) -> Bool[Array, ""]:
+        """Ask the inner executor."""
+        return self.inner.ended(carry, obs, noise[: self.inner.noise_size])
+
+
+class Actions(struct.PyTreeNode):
+    """What D's loss needs of R ticks: D's inputs, what was drawn, with which likelihood, and how it paid."""
+
+    option: Array
+    state: Array
+    duration: Array
+    action: Array
+    log_prob: Array
+    advantage: Array
+
+
+def make_optimizer(config: FineTuneConfig, max_grad_norm: Scalar) -> optax.GradientTransformation:
+    """Return Adam behind global-norm clipping for D's parameters."""
+    clip = optax.clip_by_global_norm(max_grad_norm)
+    return optax.flatten(optax.chain(clip, optax.scale_by_adam(eps=1e-5), optax.scale(-config.learning_rate)))
+
+
+def init(config: FineTuneConfig, ppo_config: PPOConfig, executor: OptionExecutor) -> Tuned:
+    """Return the learnt D, and an optimiser that has done nothing yet."""
+    decoder = executor.model.params["decoder"]
+    return Tuned(decoder, make_optimizer(config, ppo_config.max_grad_norm).init(decoder))
+
+
+def tuned_executor(executor: OptionExecutor, decoder: Any) -> OptionExecutor:
+    """Return the executor with another D."""
+    params = {**executor.model.params, "decoder": decoder}
+    return executor.replace(model=executor.model.replace(params=params))
+
+
+def fill_options(option: Float[Array, "T B D"], decision: Bool[Array, "T B"], first: Float[Array, "B D"]) -> Array:
+    """Return the option that ran at each tick [T, B, D]: the last one decided on, or `first` before any was."""
+
+    def tick(running: Array, step: tuple[Array, Array]) -> tuple[Array, Array]:
+        chosen, decides = step
+        running = jnp.where(decides[:, None], chosen, running)
+        return running, running
+
+    return jax.lax.scan(tick, first, (option, decision))[1]
+
+
+def mean_action(
+    executor: OptionExecutor, decoder: Any, option: Float[Array, " D"], state: Float[Array, " P"], tick: Int[Array, ""]
+) -> Float[Array, " A"]:
+    """Return D's output at the option's `tick`-th action, counted from 0, in this normalised state.
+
+    In open loop D runs from the option's start and never sees the state, in closed loop it needs nothing else; so
+    one unrolled call with the same state at every tick serves both.
+    """
+    states = jnp.broadcast_to(state, (executor.length, *state.shape))
+    actions, _ = apply(executor.networks.decoder, decoder, option, states)
+    return actions[tick]
+
+
+def decoder_loss(
+    decoder: Any, learnt: Any, executor: OptionExecutor, batch: Actions, config: PPOConfig, fine: FineTuneConfig
+) -> tuple[Float[Array, ""], tuple[Array, Array]]:
+    """Return PPO's clipped loss of M actions plus the weighted KL to the learnt D, and both terms."""
+    means = jax.vmap(partial(mean_action, executor, decoder))(batch.option, batch.state, batch.duration)
+    anchors = jax.vmap(partial(mean_action, executor, learnt))(batch.option, batch.state, batch.duration)
+    ratio = jnp.exp(_log_prob(batch.action, means, fine.std) - batch.log_prob)
+    clipped = jnp.clip(ratio, 1.0 - config.clip, 1.0 + config.clip)
+    surrogate = -jnp.mean(jnp.minimum(ratio * batch.advantage, clipped * batch.advantage))
+    kl = jnp.mean(jnp.sum(jnp.square(means - anchors), axis=-1)) / (2.0 * fine.std**2)
+    return surrogate + fine.kl_weight * kl, (surrogate, kl)
+
+
+def _log_prob(action: Float[Array, "M A"], mean: Float[Array, "M A"], std: Scalar) -> Float[Array, " M"]:
+    # Up to a constant, which the ratio drops.
+    return -jnp.sum(jnp.square(action - mean), axis=-1) / (2.0 * std**2)
+
+
+def iterate(
+    config: PPOConfig,
+    fine: FineTuneConfig,
+    env: Env,
+    executor: OptionExecutor,
+    state: ppo.TrainState,
+    tuned: Tuned,
+) -> tuple[ppo.TrainState, Tuned, dict[str, Array]]:
+    """Run one iteration of D: T ticks of B environments, then all epochs of updates of D alone.
+
+    Returns the state with its environments moved on, D, and the iteration's metrics.
+    """
+    key, key_rollout, key_update = jax.random.split(state.key, 3)
+    noisy = NoisyExecutor(tuned_executor(executor, tuned.decoder), fine.std)
+    decide = ppo.as_agent(config, executor, state).decide()
+    first = state.running.option.option
+    running, ticks = rollout(AutoReset(env), noisy, decide, state.running, key_rollout, config.rollout_length)
+    rows = _rows(config, fine, noisy, state, ticks, first, running.env.obs, key_rollout)
+    learnt = executor.model.params["decoder"]
+    step = partial(_epoch, config, fine, executor, learnt, rows)
+    tuned, losses = jax.lax.scan(step, tuned, jax.random.split(key_update, config.epochs))
+    metrics = {"decoder_loss": jnp.mean(losses[0]), "decoder_kl": losses[1][-1, -1]}
+    return state.replace(running=running, key=key), tuned, metrics
+
+
+def _rows(
+    config: PPOConfig,
+    fine: FineTuneConfig,
+    noisy: NoisyExecutor,
+    state: ppo.TrainState,
+    ticks: Rollout,
+    first: Float[Array, "B D"],
+    last_obs: Float[Array, "B S"],
+    key: Key[Array, ""],
+) -> Actions:
+    """Return every tick as a row, with the advantage of its action over what the critic expected there."""
+    policy, model = ppo.make_policy(noisy, config), noisy.inner.model
+    done = ticks.terminated | ticks.truncated
+    _, reward = normalize.scale_rewards(state.reward_scale, ticks.reward, done, config.gamma)
+    values = [
+        policy.value(state.params, normalize.normalize(state.obs_statistics, obs))
+        for obs in (ticks.obs, ticks.final_obs, last_obs)
+    ]
+    advantage = semi_markov_advantages(
+        reward=reward if config.normalize_reward else ticks.reward,
+        ended=jnp.ones_like(done),
+        terminated=ticks.terminated,
+        truncated=ticks.truncated,
+        value=values[0],
+        final_value=values[1],
+        last_value=values[2],
+        gamma=config.gamma,
+        lambda_=config.lambda_,
+    )
+    option = fill_options(ticks.option, ticks.decision, first)
+    proprioception = model.state_scale(ticks.obs[..., : model.state_scale.mean.shape[-1]])
+    means = jax.vmap(jax.vmap(partial(mean_action, noisy.inner, model.params["decoder"])))(
+        option, proprioception, ticks.duration - 1
+    )
+    # The same numbers that the rollout drew from this key.
+    noise = jax.random.normal(key, (*ticks.reward.shape, noisy.option_size + noisy.noise_size))
+    action = means + fine.std * noise[..., -means.shape[-1] :]
+    log_prob = jax.vmap(partial(_log_prob, std=fine.std))(action, means)
+    advantage = (advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-8)
+    rows = Actions(option, proprioception, ticks.duration - 1, action, log_prob, advantage)
+    return jax.tree.map(lambda x: x.reshape((-1, *x.shape[2:])), rows)
+
+
+def _epoch(
+    config: PPOConfig,
+    fine: FineTuneConfig,
+    executor: OptionExecutor,
+    learnt: Any,
+    rows: Actions,
+    tuned: Tuned,
+    key: Key[Array, ""],
+) -> tuple[Tuned, tuple[Array, Array]]:
+    """Pass once over all ticks in random order; a rest that fills no minibatch waits for the next pass."""
+    count = len(rows.advantage) // config.minibatch_size
+    order = jax.random.permutation(key, len(rows.advantage))[: count * config.minibatch_size]
+    batches = jax.tree.map(lambda x: x[order].reshape((count, config.minibatch_size, *x.shape[1:])), rows)
+
+    def minibatch(tuned: Tuned, batch: Actions) -> tuple[Tuned, tuple[Array, Array]]:
+        gradient, terms = jax.grad(decoder_loss, has_aux=True)(tuned.decoder, learnt, executor, batch, config, fine)
+        with jax.numpy_dtype_promotion("standard"):  # Optax raises a float to an integer power
+            updates, optimizer = make_optimizer(fine, config.max_grad_norm).update(gradient, tuned.optimizer)
+        return Tuned(optax.apply_updates(tuned.decoder, updates), optimizer), terms
+
+    return jax.lax.scan(minibatch, tuned, batches)
