@@ -24,7 +24,7 @@ from taic_jax.logging import RunLogger
 from taic_jax.networks import PolicyParams
 from taic_jax.normalize import Statistics
 from taic_jax.options import learning
-from taic_jax.options.dataset import Experience, make_dataset
+from taic_jax.options.dataset import Experience, holds_out, make_dataset
 from taic_jax.options.execution import IdentityExecutor, make_executor
 from taic_jax.options.model import OptionModel, make_networks
 from taic_jax.stage import CLOCK, Clock, Run, drive
@@ -174,6 +174,12 @@ def learn(run: Run, env: Env) -> OptionModel:
         raise ConfigError(
             f"options.length: expected the experience to hold windows of so many ticks, got none of {config.length} "
             f"in {', '.join(names)} between its shares {float(config.since):g} and {float(config.until):g}"
+        )
+    if holds_out(config) and not dataset.held_out.all():
+        raise ConfigError(
+            "options.delta_unit: quantile holds every tenth stretch of windows out, got none in those selected "
+            f"in {', '.join(names)} between its shares {float(config.since):g} and {float(config.until):g}; "
+            "error needs none"
         )
     networks = make_networks(config, env.proprioceptive_size, env.action_size)
     state = jax.jit(jax.vmap(partial(learning.init, config, networks)))(run.stage_keys("learn"))

@@ -1,4 +1,4 @@
-"""Tasks whose answers are known, options that need no model, and a reader of trees; for the tests of learning."""
+"""Tasks whose answers are known, options without a model or of a random one, and a reader of trees."""
 
 from typing import Any
 
@@ -8,7 +8,9 @@ import numpy as np
 from flax import struct
 from jax import Array
 
+from taic_jax.config import OptionsConfig
 from taic_jax.envs import Env, State
+from taic_jax.options.model import Networks, OptionModel, Scale, init_params, make_networks
 
 
 class Probe(Env):
@@ -145,6 +147,20 @@ class Repeat(struct.PyTreeNode):
     def ended(self, carry: Array, obs: Array, noise: Array) -> Array:
         """End early where there is noise, and it is positive."""
         return jnp.any(noise > 0.0)
+
+
+def draw(rng: np.random.Generator, *shape: int) -> jax.Array:
+    """Return standard normal numbers."""
+    return jnp.asarray(rng.normal(size=shape), jnp.float32)
+
+
+def random_model(config: OptionsConfig, state_size: int, action_size: int) -> tuple[Networks, OptionModel]:
+    """Return the networks, and an option model whose parameters and scales are drawn at random."""
+    rng, networks = np.random.default_rng(0), make_networks(config, state_size, action_size)
+    shapes = jax.eval_shape(lambda: init_params(networks, config, jax.random.key(0)))
+    params = jax.tree.map(lambda leaf: draw(rng, *leaf.shape), shapes)
+    scales = [Scale(draw(rng, state_size), jnp.exp(draw(rng, state_size))) for _ in range(2)]
+    return networks, OptionModel(params, *scales, jnp.ones(()))
 
 
 def numbers(tree: Any) -> list[np.ndarray]:

@@ -1,46 +1,80 @@
 """The option model: its networks step by step, its executor, and what it learns where the answer is known."""
 
+import dataclasses
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import assert_trees_equal
+from probes import assert_trees_equal, draw, random_model
 
 from taic_jax.config import OptionsConfig
 from taic_jax.options.dataset import Experience
 from taic_jax.options.execution import OptionExecutor, make_executor
 from taic_jax.options.learning import learn
-from taic_jax.options.model import OptionModel, Scale, init_params, make_networks
+from taic_jax.options.model import OptionModel, Scale, make_networks
 
 T, B, STATE_SIZE, ACTION_SIZE = 16, 32, 3, 2
 CONFIG = OptionsConfig(
     length=3, size=2, hidden_size=16, mlp_sizes=(16,), steps=150, batch_size=64, learning_rate=0.03,
     lambda_kl=1e-3, lambda_adv=0.0, select="random",
 )  # fmt: skip
+CLOSED = dataclasses.replace(CONFIG, decoder="closed", decoder_sizes=(32,))
 NETWORKS = make_networks(CONFIG, STATE_SIZE, ACTION_SIZE)
 
 
 @pytest.fixture(scope="module")
 def model() -> OptionModel:
-    """Return a model of random parameters."""
-    rng = np.random.default_rng(0)
-    shapes = jax.eval_shape(lambda: init_params(NETWORKS, CONFIG, jax.random.key(0)))
-    params = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=leaf.shape), jnp.float32), shapes)
+    """Return a model of random parameters, whose scales change nothing."""
+    return with_unit_scales(random_model(CONFIG, STATE_SIZE, ACTION_SIZE)[1])
+
+
+def with_unit_scales(model: OptionModel) -> OptionModel:
     scale = Scale(jnp.zeros(STATE_SIZE), jnp.ones(STATE_SIZE))
-    return OptionModel(params, scale, scale, jnp.ones(()))
+    return model.replace(state_scale=scale, change_scale=scale)
 
 
-def test_decoder_steps_are_the_unrolled_call(model):
-    decoder, params, option = NETWORKS.decoder, model.params["decoder"], jnp.array([0.5, -1.0])
-    states = jnp.asarray(np.random.default_rng(3).normal(size=(5, STATE_SIZE)), jnp.float32)
-    actions, logits = jax.jit(decoder.apply)(params, option, states)
+@pytest.mark.parametrize("config", [CONFIG, CLOSED], ids=["open", "closed"])
+def test_decoder_steps_are_the_unrolled_call(config):
+    networks, model = random_model(config, STATE_SIZE, ACTION_SIZE)
+    decoder, params, option = networks.decoder, model.params["decoder"], jnp.array([0.5, -1.0])
+    states = draw(np.random.default_rng(3), 5, STATE_SIZE)
+    unrolled = jax.jit(decoder.apply)
+    actions, logits = unrolled(params, option, states)
     step = jax.jit(lambda carry, state: decoder.apply(params, carry, option, state, method="step"))
     carry = decoder.apply(params, option, method="start")
     for i in range(5):
         carry, (action, logit) = step(carry, states[i])
-        np.testing.assert_allclose(action, actions[i], rtol=1e-5, atol=1e-6)
-        np.testing.assert_allclose(logit, logits[i], rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(action, actions[i], rtol=1e-5, atol=1e-5)
+        np.testing.assert_allclose(logit, logits[i], rtol=1e-5, atol=1e-5)
     assert np.abs(np.diff(actions, axis=0)).min() > 1e-3  # one action is not another
+    other, other_logits = unrolled(params, option, states.at[2].add(1.0))
+    differs = [not np.array_equal(actions[i], other[i]) for i in range(5)]
+    assert differs == [not np.array_equal(logits[i], other_logits[i]) for i in range(5)]
+    # A closed loop answers to the state of the tick, and to no other.
+    assert differs == [i == 2 and config is CLOSED for i in range(5)]
+
+
+def test_a_closed_loop_can_tell_time():
+    """In one and the same state its action and its end signal still change from tick to tick."""
+    networks, model = random_model(CLOSED, STATE_SIZE, ACTION_SIZE)
+    outputs = networks.decoder.apply(model.params["decoder"], jnp.array([0.5, -1.0]), jnp.ones((3, STATE_SIZE)))
+    for output in outputs:
+        assert np.abs(np.diff(output, axis=0)).min() > 1e-3
+
+
+def test_the_executor_shows_a_closed_loop_the_normalised_state():
+    networks, model = random_model(CLOSED, STATE_SIZE, ACTION_SIZE)
+    executor, option = make_executor(CLOSED, ACTION_SIZE, model), jnp.array([0.5, -1.0])
+    obs = draw(np.random.default_rng(4), CLOSED.length, 7)
+    states = (obs[:, :STATE_SIZE] - model.state_scale.mean[None]) / model.state_scale.std[None]
+    decoded, _ = networks.decoder.apply(model.params["decoder"], option, states)
+    act, carry = jax.jit(executor.act), executor.start(option, obs[0])
+    for i in range(CLOSED.length):
+        carry, action = act(carry, obs[i], jnp.zeros(0))
+        np.testing.assert_allclose(action, np.clip(decoded[i], -1.0, 1.0), rtol=1e-5, atol=1e-5)
+    assert np.abs(decoded).min() < 1.0  # so that not all was clipped
 
 
 def test_encoder_gives_every_prefix_at_once(model):
@@ -61,7 +95,7 @@ def test_executor_emits_the_decoders_actions_and_never_ends_early(model):
     act, carry = jax.jit(executor.act), executor.start(option, jnp.zeros(7))
     for i in range(CONFIG.length):
         # An observation may have more entries than the slice the model knows.
-        carry, action = act(carry, jnp.full(7, float(i)))
+        carry, action = act(carry, jnp.full(7, float(i)), jnp.zeros(0))
         np.testing.assert_allclose(action, np.clip(decoded[i], -1.0, 1.0), rtol=1e-5, atol=1e-6)
         assert not executor.ended(carry, jnp.zeros(7), jnp.zeros(0))
     assert (executor.length, executor.noise_size) == (CONFIG.length, 0)
@@ -108,3 +142,17 @@ def test_vmapped_seeds_are_the_seeds_alone(experience):
             # Rounding grows from step to step, so only the first are compared.
             np.testing.assert_allclose(together[name][k, :20], alone[k][name][:20], rtol=1e-3, err_msg=name)
     assert (alone[0]["kl_loss"] != alone[1]["kl_loss"]).all()
+
+
+@pytest.mark.parametrize("config", [CONFIG, CLOSED], ids=["open", "closed"])
+def test_only_a_closed_loop_learns_actions_that_depend_on_the_state(config):
+    """Actions are the mean of a window's one latent and of the state at hand, which a code of one entry cannot hold."""
+    rng = np.random.default_rng(5)
+    obs, latent = draw(rng, T, B, STATE_SIZE), draw(rng, 1, B, 1)
+    action = 0.5 * np.asarray(latent) + 0.5 * np.asarray(obs[..., :ACTION_SIZE])
+    experience = Experience(obs, jnp.asarray(action), draw(rng, T, B), jnp.zeros((T, B), bool))
+    config = dataclasses.replace(config, size=1, lambda_pred=0.0)
+    _, losses = jax.device_get(jax.jit(partial(learn, config))(experience, jax.random.key(0)))
+    share = np.mean(losses["reconstruction_loss"][-20:]) / np.var(action)
+    # Half of the variance is the latent's. E cannot tell it from the states' mean, which leaves a seventh of that.
+    assert share < 0.1 if config.decoder == "closed" else share > 0.25

@@ -5,6 +5,7 @@ import json
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
@@ -13,11 +14,14 @@ from PIL import Image
 
 from taic_jax import pipeline, stage
 from taic_jax.checkpoint import Checkpoints
-from taic_jax.config import CollectConfig, Config, EvaluateConfig, OptionsConfig, PPOConfig, TrainConfig
+from taic_jax.config import CollectConfig, Config, ConfigError, EvaluateConfig, OptionsConfig, PPOConfig, TrainConfig
 from taic_jax.config_io import load_config
+from taic_jax.envs import make_env
 from taic_jax.experience import ExperienceStore, read_experience
 from taic_jax.logging import RunLogger, read_metrics
+from taic_jax.options.dataset import Experience
 from taic_jax.pipeline import RunFolderError, run_pipeline
+from taic_jax.types import as_arrays
 
 PPO = PPOConfig(num_envs=2, rollout_length=8, epochs=1, minibatch_size=16, hidden_sizes=(4,))
 CONFIG = Config(
@@ -197,3 +201,26 @@ def test_a_seed_does_not_depend_on_how_many_run(finished, tmp_path):
         for metric, values in both[method]["metrics"].items():
             got = alone[method]["metrics"][metric]["per_seed"][0]
             np.testing.assert_allclose(got, values["per_seed"][1], rtol=1e-3, err_msg=f"{method}: {metric}")
+
+
+@pytest.mark.parametrize(
+    ("since", "until", "message"),
+    [
+        (
+            0.0,
+            0.5,
+            "options.delta_unit: quantile .* got none .* in collect between its shares 0 and 0.5; error",
+        ),
+        (0.99, 1.0, "options.length: .* got none of 2 in collect between its shares 0.99 and 1"),
+    ],
+)
+def test_experience_without_the_windows_that_are_needed_is_refused(tmp_path, monkeypatch, since, until, message):
+    """Of 160 ticks the last sixteen are held out, and the last two begin no window."""
+    env = make_env("nav2d")
+    obs, action = jnp.zeros((1, 160, 1, env.proprioceptive_size)), jnp.zeros((1, 160, 1, env.action_size))
+    experience = Experience(obs, action, reward=obs[..., 0], done=jnp.zeros((1, 160, 1), bool))
+    monkeypatch.setattr(pipeline, "gather_experience", lambda *_: experience)
+    options = dataclasses.replace(CONFIG.options, termination="predict", since=since, until=until)
+    config = as_arrays(dataclasses.replace(CONFIG, options=options))
+    with RunLogger(tmp_path) as logger, pytest.raises(ConfigError, match=message):
+        pipeline.learn(stage.Run(config, jax.random.split(jax.random.key(0), 1), tmp_path, logger, stage.Clock()), env)

@@ -135,6 +135,16 @@ def test_the_step_size_falls_linearly_to_zero(iterate, first_state):
         assert not c.any()
 
 
+def test_durations_are_counted_where_options_take_more_than_a_tick(iterate, first_state):
+    _, metrics, ticks = iterate(first_state)
+    np.testing.assert_array_equal(metrics["durations"], np.bincount(ticks.duration[ticks.ended], minlength=4)[1:])
+    assert metrics["durations"].shape == (3,) and metrics["durations"].min() > 0
+    flat, config = IdentityExecutor(1), as_arrays(ONE_STEP)
+    state = jax.eval_shape(partial(ppo.init, config, ENV, flat), jax.random.key(3))
+    _, of_flat, _ = jax.eval_shape(partial(ppo.iterate, config, ENV, flat, ITERATIONS), state)
+    assert set(of_flat) == set(metrics) - {"durations"}
+
+
 def pairs(a: jax.Array, b: jax.Array) -> list[tuple[float, float]]:
     return list(zip(a.tolist(), b.tolist(), strict=True))
 

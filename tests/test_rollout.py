@@ -3,13 +3,14 @@
 from functools import partial
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from probes import Counting, Repeat, assert_trees_equal
 
 from taic_jax.envs import AutoReset
 from taic_jax.options.execution import IdentityExecutor
-from taic_jax.rl.rollout import Rollout, Running, rollout, start
+from taic_jax.rl.rollout import Rollout, Running, count_durations, rollout, start
 
 B, N, END = 4, 3, 7
 
@@ -120,3 +121,45 @@ def test_flat_control_decides_at_every_tick_and_takes_one_step_in_each():
     np.testing.assert_array_equal(ticks.action, np.clip(ticks.option, -1.0, 1.0))
     _, (of_one_tick,) = run(Counting(), Repeat(1), draw, 9)
     assert_trees_equal(ticks, of_one_tick)
+
+
+def recorded(noise_size: int, decide=draw) -> tuple[Repeat, Rollout]:
+    """Run options of at most 3 ticks in episodes of 7 or fewer, with or without noise that ends them early."""
+    executor = Repeat(N, noise_size=noise_size)
+    _, (ticks,) = run(Counting(END, truncated=True, spread=5), executor, decide, 25)
+    return executor, ticks
+
+
+@pytest.mark.parametrize("noise_size", [0, 1])
+def test_durations_are_counted_where_options_end(noise_size):
+    _, ticks = recorded(noise_size)
+    where = np.arange(25)[:, None] < np.array([25, 10, 3, 0])
+    for shown, among in ((True, np.ones((25, B), bool)), (where, where)):
+        expected = np.zeros(N)
+        for b in range(B):
+            ran = 0
+            for t in range(25):
+                ran = 1 if ticks.decision[t, b] else ran + 1
+                assert ticks.duration[t, b] == ran
+                expected[ran - 1] += ticks.ended[t, b] and among[t, b]
+        counts = count_durations(ticks, N, shown if shown is True else jnp.asarray(shown))
+        np.testing.assert_array_equal(counts, expected)
+        assert counts.dtype == np.float32 and expected.all()
+
+
+def test_noise_ends_options_early_and_is_not_the_policys():
+    """The executor's numbers come after the option's, fresh at every tick and in every environment."""
+    _, ticks = recorded(1)
+    noise = np.asarray(jax.random.normal(jax.random.key(1), (25, B, 2)))
+    done = ticks.truncated
+    np.testing.assert_array_equal(ticks.option, noise[..., :1])
+    np.testing.assert_array_equal(ticks.ended, (noise[..., 1] > 0) | (ticks.duration == N) | done)
+    early = ticks.ended & (ticks.duration < N) & ~done
+    assert early.sum() > 10 and (~ticks.ended).sum() > 10
+    assert (noise[..., 0] > 0)[early].any() and (noise[..., 0] < 0)[early].any()
+
+
+def test_without_noise_the_policy_draws_as_it_did(counted):
+    _, ticks = counted
+    np.testing.assert_array_equal(ticks.option, jax.random.normal(jax.random.key(1), (25, B, 1)))
+    assert_trees_equal(recorded(0)[1], ticks)

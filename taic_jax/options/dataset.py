@@ -80,7 +80,7 @@ def make_dataset(experience: Experience | Sequence[Experience], config: OptionsC
     """
     sources = [experience] if isinstance(experience, Experience) else list(experience)
     needed = STRETCH * HELD_OUT_EVERY * config.length
-    if _holds_out(config) and all(len(source.reward) < needed for source in sources):
+    if holds_out(config) and all(len(source.reward) < needed for source in sources):
         raise ShortExperienceError(
             f"options.delta_unit: quantile needs {needed} ticks of each environment, to hold every tenth stretch of "
             f"{STRETCH} windows out; got {max(len(source.reward) for source in sources)}; error needs none"
@@ -100,7 +100,7 @@ def make_dataset(experience: Experience | Sequence[Experience], config: OptionsC
     return Dataset(rows, starts, count, held, _scale(state), _scale(change))
 
 
-def _holds_out(config: OptionsConfig) -> bool:
+def holds_out(config: OptionsConfig) -> bool:
     """Return whether P's error on windows that were not learnt from is asked for."""
     return config.termination == "predict" and config.delta_unit == "quantile"
 
@@ -114,7 +114,7 @@ def _candidates(experience: Experience, config: OptionsConfig, first_part: int) 
     valid = valid & ((config.since <= share) & (share < config.until))[:, None]
     part = ((share - config.since) / (config.until - config.since) * config.parts).astype(jnp.int32)
     held_out = (tick // (STRETCH * config.length)) % HELD_OUT_EVERY == HELD_OUT_EVERY - 1
-    held_out = held_out & _holds_out(config)
+    held_out = held_out & holds_out(config)
     return (
         _flatten(jnp.where(valid, score, jnp.nan)),
         jnp.tile(first_part + jnp.clip(part, 0, config.parts - 1), num_envs),

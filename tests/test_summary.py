@@ -1,0 +1,27 @@
+"""What a run's summary says, by hand."""
+
+import numpy as np
+import pytest
+
+from taic_jax.summary import _durations, _method
+
+
+def test_durations_by_hand():
+    # Seed 0: 1 option of one tick, 3 of three; seed 1: 2 of one, 2 of two, 2 of three.
+    summary = _durations(np.array([[1.0, 0.0, 3.0], [2.0, 2.0, 2.0]]))
+    assert summary["per_seed"] == [2.5, 2.0] and summary["mean"] == 2.25
+    assert summary["histogram"] == pytest.approx([0.3, 0.2, 0.5])  # of all ten options
+
+
+def test_durations_of_a_method_are_those_of_the_exploring_policy():
+    """The counts of the mean options are not a metric with one number per seed, and are left out."""
+    counts = np.array([[1.0, 3.0]], np.float32)
+    evaluation = {"return": np.array([5.0]), "length": np.array([4.0])}
+    last = {
+        "return": evaluation | {"durations": counts},
+        "return_mean_option": evaluation | {"durations": counts[:, ::-1]},
+    }
+    method = _method(last, last)
+    assert method["duration"]["mean"] == 1.75 and method["duration"]["histogram"] == [0.25, 0.75]
+    assert set(method["metrics"]) == {"return", "length"}
+    assert "durations" in last["return_mean_option"]
