@@ -119,7 +119,7 @@ class OptionsConfig:
     delta_unit: Literal["error", "quantile"] = "quantile"
     """What delta counts: P's error itself, or the share of held-out predictions whose error is smaller."""
     steps: int = 2000
-    """Gradient steps."""
+    """Gradient steps; 0 leaves the option model as random as it was drawn."""
     batch_size: int = 128
     """Windows per gradient step."""
     learning_rate: float = 3e-3
@@ -194,6 +194,7 @@ BOUNDS: dict[str, tuple[float, float]] = {
     "until": (0, 1),
     "change_after": (0, math.inf),
     "num_threads": (0, math.inf),
+    "steps": (0, math.inf),
     "seed": (0, 2**31 - 1),
     "video_ticks": (0, math.inf),
     "clip": (TINY, math.inf),
@@ -221,11 +222,29 @@ def validate(config: Config) -> None:
     if length > ticks:
         raise _impossible("options.length", length, f"at most train.ppo.rollout_length = {ticks}", ticks)
     _check_options(config.options)
-    if "transfer" in config.train.baselines and not config.options.source:
-        raise ConfigError("train.baselines: transfer needs the run to start from, as in --options RUN; got none")
+    _check_baselines(config)
+
+
+def _check_baselines(config: Config) -> None:
+    """Check what flat PPO beside the options needs; it is configured by `collect.ppo`."""
+    ppo, baselines = config.collect.ppo, config.train.baselines
+    ticks, length = ppo.num_envs * ppo.rollout_length, config.options.length
+    if "transfer" in baselines and not config.options.source:
+        raise ConfigError(
+            "train.baselines: expected with transfer a run to take options and flat policy from; "
+            "got none: add --options RUN, as in --options runs/ant"
+        )
+    if "repeat" in baselines and length > ppo.rollout_length:
+        expected = f"with baseline repeat at most collect.ppo.rollout_length = {ppo.rollout_length}"
+        raise _impossible("options.length", length, expected, ppo.rollout_length)
+    if baselines and config.train.ticks < ticks:
+        iteration = f"one iteration of the baselines, collect.ppo.num_envs * collect.ppo.rollout_length = {ticks}"
+        raise _impossible("train.ticks", config.train.ticks, f"at least {iteration}", ticks)
 
 
 def _check_options(options: OptionsConfig) -> None:
+    if options.source and options.experience:
+        raise ConfigError(f"options.experience: expected none with options.source, got {list(options.experience)}")
     if options.shortest > options.length:
         expected = f"at most options.length = {options.length}"
         raise _impossible("options.shortest", options.shortest, expected, options.length)
