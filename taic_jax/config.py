@@ -192,9 +192,9 @@ TINY = 1e-6
 BOUNDS: dict[str, tuple[float, float]] = {
     "since": (0, 1),
     "until": (0, 1),
+    "steps": (0, math.inf),
     "change_after": (0, math.inf),
     "num_threads": (0, math.inf),
-    "steps": (0, math.inf),
     "seed": (0, 2**31 - 1),
     "video_ticks": (0, math.inf),
     "clip": (TINY, math.inf),
@@ -230,16 +230,14 @@ def _check_baselines(config: Config) -> None:
     ppo, baselines = config.collect.ppo, config.train.baselines
     ticks, length = ppo.num_envs * ppo.rollout_length, config.options.length
     if "transfer" in baselines and not config.options.source:
-        raise ConfigError(
-            "train.baselines: expected with transfer a run to take options and flat policy from; "
-            "got none: add --options RUN, as in --options runs/ant"
-        )
-    if "repeat" in baselines and length > ppo.rollout_length:
-        expected = f"with baseline repeat at most collect.ppo.rollout_length = {ppo.rollout_length}"
-        raise _impossible("options.length", length, expected, ppo.rollout_length)
+        needed = "a run with options and a flat policy"
+        raise ConfigError(f"train.baselines: expected with transfer {needed}, got none: add --options RUN")
+    if "repeat" in baselines and length > (longest := ppo.rollout_length):
+        expected = f"with baseline repeat at most collect.ppo.rollout_length = {longest}"
+        raise _impossible("options.length", length, expected, longest)
     if baselines and config.train.ticks < ticks:
-        iteration = f"one iteration of the baselines, collect.ppo.num_envs * collect.ppo.rollout_length = {ticks}"
-        raise _impossible("train.ticks", config.train.ticks, f"at least {iteration}", ticks)
+        iteration = f"collect.ppo.num_envs * collect.ppo.rollout_length = {ticks}"
+        raise _impossible("train.ticks", config.train.ticks, f"at least an iteration of baselines, {iteration}", ticks)
 
 
 def _check_options(options: OptionsConfig) -> None:
@@ -250,9 +248,8 @@ def _check_options(options: OptionsConfig) -> None:
         raise _impossible("options.shortest", options.shortest, expected, options.length)
     if options.delta_unit == "quantile" and options.delta > 1:
         raise _impossible("options.delta", options.delta, "at most 1, being a quantile", 1.0)
-    since, until = options.since, options.until
-    if since >= until:
-        raise _impossible("options.since", since, f"less than options.until = {until}", 0.0)
+    if options.since >= options.until:
+        raise _impossible("options.since", options.since, f"less than options.until = {options.until}", 0.0)
 
 
 def needs_collect(config: Config) -> bool:

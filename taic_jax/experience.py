@@ -131,23 +131,12 @@ def gather_experience(source: Path, env: Env, seeds: int) -> Experience:
     Raises:
       ArtifactError: nothing readable is there, or it is of another body.
     """
-    folder, description = find_experience(source, env)
-    if description is None:
+    folder = source / EXPERIENCE if (source / EXPERIENCE).is_dir() else source
+    if not (folder / DESCRIPTION).is_file():
+        if not source.exists() or (source / "config.yaml").is_file():
+            raise ArtifactError(f"{source}: expected a run that collected experience, or demonstrations; got none")
         demonstrations = read_demonstrations(source, env.proprioceptive_size, env.action_size)
         return jax.tree.map(lambda x: jnp.broadcast_to(x, (seeds, *x.shape)), demonstrations)
+    description = read_description(folder, "experience", env)
     columns = [read_experience(folder, seed % description["seeds"]) for seed in range(seeds)]
     return jax.tree.map(lambda *x: jnp.stack(x), *columns)
-
-
-def find_experience(source: Path, env: Env) -> tuple[Path, dict | None]:
-    """Return the folder of what a run collected with its description, or where demonstrations are, and None.
-
-    Raises:
-      ArtifactError: nothing is there, or it is of another body.
-    """
-    folder = source / EXPERIENCE if (source / EXPERIENCE).is_dir() else source
-    if (folder / DESCRIPTION).is_file():
-        return folder, read_description(folder, "experience", env)
-    if not source.exists():
-        raise ArtifactError(f"{source}: expected experience of a run, or demonstrations; got nothing")
-    return source, None

@@ -25,7 +25,6 @@ from taic_jax.experience import (
     EXPERIENCE,
     ExperienceStore,
     as_experience,
-    find_experience,
     gather_experience,
     num_blocks,
 )
@@ -159,7 +158,7 @@ def take_over(
 ) -> tuple[OptionModel | None, tuple[PolicyParams, Statistics] | None]:
     """Return the option models and flat policies [K] that the config takes from another run, where it does.
 
-    Seed k takes the k-th, modulo their number. Experience to learn from is only looked for.
+    Seed k takes the k-th, modulo their number. Experience is only checked, by reading one seed's.
 
     Raises:
       ArtifactError: nothing is there, or it was made for another body or with another structure.
@@ -173,7 +172,7 @@ def take_over(
     else:
         for name in config.options.experience:
             if name != COLLECT:
-                find_experience(Path(name), source)
+                gather_experience(Path(name), source, 1)
     return model, policy
 
 
