@@ -49,11 +49,12 @@ def read_description(folder: Path, kind: str, env: Env, structure: dict[str, Any
         raise ArtifactError(f"{folder}: expected a run that got this far, or its {kind}; got none") from None
     if not isinstance(description, dict) or not isinstance(description.get("seeds"), int):
         raise ArtifactError(f"{folder / DESCRIPTION}: expected the description of an artifact, got another file")
-    for name, value in {**describe(env), **(structure or {}), "env": description.get("env")}.items():
+    body = {name: value for name, value in describe(env).items() if name != "env"}
+    for name, value in {**body, **(structure or {})}.items():
         value = list(value) if isinstance(value, tuple) else value
         if description.get(name) != value:
-            got = description.get(name)
-            raise ArtifactError(f"{folder}: {name}: expected {value!r}, which {env.name} needs; got {got!r}")
+            got, why = description.get(name), f"which {env.name} needs" if name in body else "as in this config"
+            raise ArtifactError(f"{folder / DESCRIPTION}: {name}: expected {value!r}, {why}; got {got!r}")
     return description
 
 

@@ -119,7 +119,7 @@ class OptionsConfig:
     delta_unit: Literal["error", "quantile"] = "quantile"
     """What delta counts: P's error itself, or the share of held-out predictions whose error is smaller."""
     steps: int = 2000
-    """Gradient steps."""
+    """Gradient steps; 0 leaves the option model as random as it was drawn."""
     batch_size: int = 128
     """Windows per gradient step."""
     learning_rate: float = 3e-3
@@ -209,6 +209,7 @@ TINY = 1e-6
 BOUNDS: dict[str, tuple[float, float]] = {
     "since": (0, 1),
     "until": (0, 1),
+    "steps": (0, math.inf),
     "change_after": (0, math.inf),
     "num_threads": (0, math.inf),
     "seed": (0, 2**31 - 1),
@@ -240,19 +241,34 @@ def validate(config: Config) -> None:
     if length > ticks:
         raise _impossible("options.length", length, f"at most train.ppo.rollout_length = {ticks}", ticks)
     _check_options(config.options)
-    if "transfer" in config.train.baselines and not config.options.source:
-        raise ConfigError("train.baselines: transfer needs the run to start from, as in --options RUN; got none")
+    _check_baselines(config)
+
+
+def _check_baselines(config: Config) -> None:
+    """Check what flat PPO beside the options needs; it is configured by `collect.ppo`."""
+    ppo, baselines = config.collect.ppo, config.train.baselines
+    ticks, length = ppo.num_envs * ppo.rollout_length, config.options.length
+    if "transfer" in baselines and not config.options.source:
+        needed = "a run with options and a flat policy"
+        raise ConfigError(f"train.baselines: expected with transfer {needed}, got none: add --options RUN")
+    if "repeat" in baselines and length > (longest := ppo.rollout_length):
+        expected = f"with baseline repeat at most collect.ppo.rollout_length = {longest}"
+        raise _impossible("options.length", length, expected, longest)
+    if baselines and config.train.ticks < ticks:
+        iteration = f"collect.ppo.num_envs * collect.ppo.rollout_length = {ticks}"
+        raise _impossible("train.ticks", config.train.ticks, f"at least an iteration of baselines, {iteration}", ticks)
 
 
 def _check_options(options: OptionsConfig) -> None:
+    if options.source and options.experience:
+        raise ConfigError(f"options.experience: expected none with options.source, got {list(options.experience)}")
     if options.shortest > options.length:
         expected = f"at most options.length = {options.length}"
         raise _impossible("options.shortest", options.shortest, expected, options.length)
     if options.delta_unit == "quantile" and options.delta > 1:
         raise _impossible("options.delta", options.delta, "at most 1, being a quantile", 1.0)
-    since, until = options.since, options.until
-    if since >= until:
-        raise _impossible("options.since", since, f"less than options.until = {until}", 0.0)
+    if options.since >= options.until:
+        raise _impossible("options.since", options.since, f"less than options.until = {options.until}", 0.0)
 
 
 def needs_collect(config: Config) -> bool:
@@ -291,11 +307,13 @@ def _check_bounds(name: str, value: Any) -> None:
 
 def _check_sizes(stage: str, config: CollectConfig | TrainConfig) -> None:
     ppo, ticks = config.ppo, config.ppo.num_envs * config.ppo.rollout_length
+    every = config.fine_tune.every if isinstance(config, TrainConfig) else 0
     iteration = f"{stage}.ppo.num_envs * {stage}.ppo.rollout_length = {ticks}"
     if ppo.minibatch_size > ticks:
         raise _impossible(f"{stage}.ppo.minibatch_size", ppo.minibatch_size, f"at most {iteration}", ticks)
-    if config.ticks < ticks:
-        raise _impossible(f"{stage}.ticks", config.ticks, f"at least one iteration, {iteration}", ticks)
+    if config.ticks < ticks * (every + 1):
+        step = f"{every + 1} iterations of {iteration}" if every else f"one iteration, {iteration}"
+        raise _impossible(f"{stage}.ticks", config.ticks, f"at least {step}", ticks * (every + 1))
 
 
 def _impossible(name: str, value: Any, expected: str, nearest: int | float) -> ConfigError:

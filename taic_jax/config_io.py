@@ -1,4 +1,4 @@
-"""Configurations from YAML and back: a preset or file holds only its differences from the defaults."""
+"""Configurations from YAML and back: a preset or file holds only its differences from the defaults or its base."""
 
 import contextlib
 import dataclasses
@@ -12,14 +12,37 @@ import yaml
 
 from taic_jax.config import Config, ConfigError, walk
 
+BASE = "base"
+"""Key of a file that names what it starts from, a preset or another file; without it, the defaults."""
+
 
 def load_config(source: str | Path) -> Config:
     """Load a preset by its name, or a YAML file by its path.
 
     Raises:
-        ConfigError: it is missing, is not YAML, or holds an unknown field or a mistyped value.
+        ConfigError: it or its base is missing, is not YAML, or holds an unknown field or a mistyped value.
     """
-    text = _read_text(str(source))
+    return _load(str(source), ())
+
+
+def _load(source: str, above: tuple[str, ...]) -> Config:
+    """Load what the files `above` start from, the last of them at once."""
+    if source in above:
+        raise ConfigError(f"{above[0]}: base: expected an end, got {' -> '.join((*above, source))}")
+    try:
+        changes = _read_changes(source)
+    except ConfigError as error:
+        raise (ConfigError(f"{above[-1]}: base: {error}") if above else error) from None
+    if BASE not in changes:
+        return _override(Config(), changes)
+    base = changes.pop(BASE)
+    if not isinstance(base, str):
+        raise ConfigError(f"{source}: base: expected a preset's name or a file, got {_show(base)}")
+    return _override(_load(base, (*above, source)), changes)
+
+
+def _read_changes(source: str) -> dict:
+    text = _read_text(source)
     try:
         changes = yaml.load(text, Loader=_Loader)
     except yaml.YAMLError as error:
@@ -29,7 +52,7 @@ def load_config(source: str | Path) -> Config:
         raise ConfigError(f"{source}: expected YAML, got a mistake{where}: {problem}") from None
     if not isinstance(changes, dict):
         raise ConfigError(f"{source}: expected a mapping such as 'seed: 0', got {_show(changes)}")
-    return _override(Config(), changes)
+    return changes
 
 
 def to_yaml(config: Config) -> str:
@@ -102,7 +125,7 @@ def _override(default: Any, changes: Any, prefix: str = "") -> Any:
     values = {}
     for name, value in changes.items():
         if name not in kinds:
-            groups = [f"{prefix}{kind}" for kind in kinds]
+            groups = [f"{prefix}{kind}" for kind in kinds] + [BASE] * (not prefix)
             nearest = closest(f"{prefix}{name}", groups + [known for known, _ in walk(Config())])
             raise ConfigError(f"unknown field {prefix}{name}; the nearest is {nearest}")
         old = getattr(default, name)

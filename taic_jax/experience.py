@@ -133,6 +133,8 @@ def gather_experience(source: Path, env: Env, seeds: int) -> Experience:
     """
     folder = source / EXPERIENCE if (source / EXPERIENCE).is_dir() else source
     if not (folder / DESCRIPTION).is_file():
+        if not source.exists() or (source / "config.yaml").is_file():
+            raise ArtifactError(f"{source}: expected a run that collected experience, or demonstrations; got none")
         demonstrations = read_demonstrations(source, env.proprioceptive_size, env.action_size)
         return jax.tree.map(lambda x: jnp.broadcast_to(x, (seeds, *x.shape)), demonstrations)
     description = read_description(folder, "experience", env)

@@ -17,6 +17,7 @@ from taic_jax.options.dataset import Experience
 from taic_jax.options.execution import Executor
 from taic_jax.options.model import OptionModel
 from taic_jax.rl import fine_tune, ppo
+from taic_jax.rl.fine_tune import Tuned
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,7 @@ class FineTunedLevel(Level):
         """Ticks of one step."""
         return super().unit * (self.fine_tune.every + 1)
 
-    def init(self, key: Array, *model: OptionModel) -> tuple[ppo.TrainState, fine_tune.Tuned]:
+    def init(self, key: Array, *model: OptionModel) -> tuple[ppo.TrainState, Tuned]:
         """Return the state of an untrained policy, and the learnt D."""
         executor: Any = self.executor_of(*model)
         return super().init(key, *model), fine_tune.init(self.fine_tune, self.config, executor)

@@ -119,7 +119,7 @@ def measure(
     mean = np.asarray(windows.mean)
     kl = kl_per_dimension(mean, np.asarray(windows.log_std))
     result = {"active_dimensions": float(active_dimensions(mean)), "kl": float(kl.sum())}
-    measured = measure_option_space(*map(np.asarray, (data, windows.start, windows.end)))
+    measured = measure_option_space(np.asarray(data), np.asarray(windows.start), np.asarray(windows.end))
     result |= {f"window/{name}": value for name, value in measured.items()}
     cases = [(kind, option, many) for kind, option in (("prior", prior), ("data", data)) for many in (False, True)]
     for (kind, option, many), key_run in zip(cases, keys, strict=True):

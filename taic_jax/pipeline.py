@@ -44,8 +44,10 @@ def run_pipeline(config: Config, run_dir: Path, *, resume: bool = False, overwri
     Raises:
       RunFolderError: the folder holds another run, or none where one is to be resumed.
       ConfigError: the config does not fit the environment.
+      ArtifactError: another run does not hold what the config takes from it.
     """
     env, source = make_envs(config)
+    model, policy = take_over(config, env, source)  # what is refused is refused before anything is written
     prepare_folder(config, run_dir, resume=resume, overwrite=overwrite)
     # Seed k of a run is seed 0 of a run whose seed is k more.
     keys = jnp.stack([jax.random.key(config.seed + k) for k in range(config.seeds)])
@@ -53,12 +55,12 @@ def run_pipeline(config: Config, run_dir: Path, *, resume: bool = False, overwri
         run = Run(as_arrays(config), keys, run_dir, logger, Clock.load(run_dir / CLOCK))
         logger.truncate("evaluate", -1)
         collector = collect(run, source) if needs_collect(config) else None
-        model = frozen_options(run, env) if config.options.source else learn(run, source)
+        model = learn(run, source) if model is None else model
         methods = {"taic": train_over_options(run, env, model)}
         for name in config.train.baselines:
             # Where experience comes from the task itself, the collector is the flat baseline.
             done = collector if name == "flat" and collector_is_baseline(config) else None
-            methods[name] = done or train_baseline(run, env, name)
+            methods[name] = done or train_baseline(run, env, name, policy)
     summary = as_summary(run, {name: {"first": x.first, "last": x.last} for name, x in methods.items()})
     (run_dir / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
     try:
@@ -80,10 +82,10 @@ def make_envs(config: Config) -> tuple[Env, Env]:
     if config.collect.env:
         kept = ("backend", "num_threads", *environment_options(config.collect.env))
         source = make_env(config.collect.env, **{option: options[option] for option in kept})
-    bodies = [(e.proprioceptive_size, e.action_size) for e in (source, env)]
+    bodies = [(*describe(e).values(),)[1:] for e in (source, env)]
     if bodies[0] != bodies[1]:
         raise ConfigError(
-            f"collect.env: expected the body of {config.env.name} (proprioceptive slice and action sizes "
+            f"collect.env: expected the body of {config.env.name} (proprioceptive slice, its size, and action size "
             f"{bodies[1]}), got {config.collect.env} with {bodies[0]}"
         )
     if config.options.length > env.episode_length:
@@ -92,6 +94,29 @@ def make_envs(config: Config) -> tuple[Env, Env]:
             f"got {config.options.length}; the nearest valid value is {env.episode_length}"
         )
     return env, source
+
+
+def take_over(
+    config: Config, env: Env, source: Env
+) -> tuple[OptionModel | None, tuple[PolicyParams, Statistics] | None]:
+    """Return the option models and flat policies [K] that the config takes from another run, where it does.
+
+    Seed k takes the k-th, modulo their number. Experience is only checked, by reading one seed's.
+
+    Raises:
+      ArtifactError: nothing is there, or it was made for another body or with another structure.
+    """
+    model = policy = None
+    if config.options.source:
+        folder = Path(config.options.source)
+        model = load_options(folder, env, config.options, config.seeds)
+        if "transfer" in config.train.baselines:
+            policy = load_policy(folder, env, config.collect.ppo, config.seeds)
+    else:
+        for name in config.options.experience:
+            if name != COLLECT:
+                gather_experience(Path(name), source, 1)
+    return model, policy
 
 
 def prepare_folder(config: Config, run_dir: Path, *, resume: bool = False, overwrite: bool = False) -> None:
@@ -114,6 +139,9 @@ def prepare_folder(config: Config, run_dir: Path, *, resume: bool = False, overw
             raise RunFolderError(f"{run_dir} already holds files; add --resume, --overwrite or another --run-dir")
         if not saved.is_file():
             raise RunFolderError(f"{run_dir} is not a run's folder (no config.yaml in it), so it is not overwritten")
+        for name in {config.options.source, *config.options.experience} - {"", COLLECT}:
+            if Path(name).resolve().is_relative_to(run_dir.resolve()):
+                raise RunFolderError(f"{run_dir} holds what this run starts from, {name}, so it is not overwritten")
         shutil.rmtree(run_dir)
     run_dir.mkdir(parents=True, exist_ok=True)
     saved.write_text(text)
@@ -192,12 +220,6 @@ def learn(run: Run, env: Env) -> OptionModel:
     return model
 
 
-def frozen_options(run: Run, env: Env) -> OptionModel:
-    """Load the option models that `options.source` names; seed k takes the k-th, modulo their number."""
-    config = run.config.options
-    return load_options(Path(config.source), env, config, len(run.keys))
-
-
 def train_over_options(run: Run, env: Env, model: OptionModel) -> Trained:
     """Train the policy that acts by choosing options; a fine-tuned D is saved as the artifact `options_fine_tuned`."""
     config = run.config
@@ -212,12 +234,9 @@ def train_over_options(run: Run, env: Env, model: OptionModel) -> Trained:
     return trained
 
 
-def train_baseline(run: Run, env: Env, name: str) -> Trained:
-    """Train flat PPO on the task: see `TrainConfig.baselines`."""
+def train_baseline(run: Run, env: Env, name: str, policy: tuple[PolicyParams, Statistics] | None = None) -> Trained:
+    """Train flat PPO on the task, `transfer` from another run's policy: see `TrainConfig.baselines`."""
     config = run.config
     ticks = config.train.ticks + (config.collect.ticks if name == "total" else 0)
     level = _flat(run, env, ticks, config.options.length if name == "repeat" else 1)
-    begin = None
-    if name == "transfer":
-        begin = load_policy(Path(config.options.source), env, config.collect.ppo, len(run.keys))
-    return _train(run, name, level, begin=begin)
+    return _train(run, name, level, begin=policy if name == "transfer" else None)

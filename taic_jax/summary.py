@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from taic_jax.config import Config, collector_is_baseline, needs_collect
+from taic_jax.config import COLLECT, Config, collector_is_baseline, needs_collect
 from taic_jax.envs.base import Env
 from taic_jax.evaluate import record
 from taic_jax.experience import experience_bytes
@@ -34,14 +34,17 @@ def plan(config: Config, env: Env, source: Env) -> str:
         iterations = num_iterations(ppo, ticks)
         real = iterations * ppo.num_envs * ppo.rollout_length
         lines.append(f"{stage:8} {task.name}: {real:,} ticks x {config.seeds} seeds in {iterations} iterations")
-    kept = min(collect.capacity, collect.ticks)
-    size = experience_bytes(source, kept) * config.seeds / MIB
+    collects = needs_collect(config)
     if options.source:
-        return "\n".join([f"{'options':8} as learnt in {options.source}", *lines])
-    lines.insert(
-        needs_collect(config), f"{'learn':8} {options.steps:,} gradient steps on windows of {options.length} ticks"
-    )
-    lines.append(f"{'memory':8} experience {size:,.0f} MiB on disk, {2 * size:,.0f} MiB while options are learnt")
+        learn = f"{'options':8} as learnt in {options.source}"
+    else:
+        names = ", ".join(options.experience or (COLLECT,))
+        learn = f"{'learn':8} {options.steps:,} gradient steps on windows of {options.length} ticks from {names}"
+    lines.insert(1 if collects else 0, learn)
+    if collects:
+        size = experience_bytes(source, min(collect.capacity, collect.ticks)) * config.seeds / MIB
+        memory = "" if options.source else f", {2 * size:,.0f} MiB while options are learnt"
+        lines.append(f"{'memory':8} experience {size:,.0f} MiB on disk{memory}")
     return "\n".join(lines)
 
 

@@ -74,7 +74,25 @@ def test_dry_run_prints_the_config_and_the_plan_and_stops(pipeline, capsys):
     assert out.endswith("the plan\n") and pipeline == []
 
 
+def test_options_of_a_run_are_short_for_their_source():
+    for args in (["--options", "runs/a"], ["--options=runs/a"], ["--options.source", "runs/a"]):
+        assert parse(["ant", *args]).config.options.source == "runs/a"
+        config = parse(["transfer_ant_turn", *args, "--options.length", "4"]).config
+        assert (config.options.source, config.options.length, config.env.name) == ("runs/a", 4, "ant_turn")
+
+
 BAD_ARGUMENTS = {
+    "transfer from nowhere": (
+        "transfer_ant_maze",
+        "train.baselines: expected with transfer a run",
+        "add --options RUN",
+    ),
+    "options of nothing": ("ant --options", "--options: expected text", "nothing"),
+    "options and experience": (
+        "ant --options a --options.experience b",
+        "options.experience: expected none with options.source",
+        "got ['b']",
+    ),
     "unknown preset": ("nav2", "unknown preset 'nav2'", "nearest is nav2d"),
     "missing file": ("missing.yaml", "missing.yaml", "No such file"),
     "folder": ("./", "./", "directory"),

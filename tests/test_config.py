@@ -1,8 +1,7 @@
-"""Configurations: defaults are valid, files are read strictly, presets hold only differences."""
+"""Configurations: defaults are valid, files are read strictly, impossible values are told."""
 
 import dataclasses
 import functools
-import itertools
 import math
 from pathlib import Path
 from typing import get_args, get_origin, get_type_hints
@@ -14,7 +13,7 @@ from hypothesis import strategies as st
 
 from taic_jax import config as config_module
 from taic_jax.config import BOUNDS, CONFIG_CLASSES, Config, ConfigError, PPOConfig, validate, walk
-from taic_jax.config_io import closest, load_config, preset_names, to_yaml
+from taic_jax.config_io import closest, load_config, to_yaml
 
 
 def write(tmp_path: Path, text: str) -> Path:
@@ -33,18 +32,23 @@ def test_defaults_are_valid():
     validate(Config())
 
 
-@pytest.mark.parametrize("name", preset_names())
-def test_presets_load_are_valid_and_hold_only_differences(name):
-    preset = load_config(name)
-    validate(preset)
-    text = (Path(config_module.__file__).parent / "experiments/presets" / f"{name}.yaml").read_text()
-    defaults = yaml.safe_load(to_yaml(Config()))
-
-    def same(changes: dict, old: dict) -> list[str]:
-        nested = [same(changes[key], old[key]) for key in changes if isinstance(changes[key], dict)]
-        return [key for key in changes if changes[key] == old[key]] + list(itertools.chain(*nested))
-
-    assert same(yaml.safe_load(text), defaults) == []
+def test_what_baselines_and_sources_need_is_told():
+    default = Config()
+    few = replace(replace(default, "collect.ppo.rollout_length", 16), "options.length", 17)
+    transfer = replace(default, "train.baselines", ("transfer",))
+    many = replace(replace(default, "collect.ppo.num_envs", 100), "collect.ppo.rollout_length", 10_000)
+    both = replace(replace(default, "options.source", "a"), "options.experience", ("b",))
+    for config, expected in {
+        transfer: "train.baselines: expected with transfer a run",
+        replace(few, "train.baselines", ("repeat",)): "options.length: expected with baseline repeat",
+        replace(many, "train.ticks", 999_999): "train.ticks: expected at least an iteration of baselines",
+        both: "options.experience: expected none with options.source",
+    }.items():
+        with pytest.raises(ConfigError, match=expected) as error:
+            validate(config)
+        assert "\n" not in str(error.value)
+    for config in (few, replace(many, "train.baselines", ()), replace(default, "options.steps", 0)):
+        validate(config)
 
 
 def test_yaml_names_every_field():
@@ -171,6 +175,7 @@ IMPOSSIBLE = [
     ("options.mlp_sizes", (), 64),
     ("options.length", 513, 512),
     ("options.fraction", 1.5, 1),
+    ("options.steps", -1, 0),
     ("options.since", 1.0, 0.0),
     ("options.until", 1.1, 1),
     ("evaluate.video_ticks", -1, 0),

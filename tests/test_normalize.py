@@ -50,3 +50,19 @@ def test_scaled_rewards_are_bounded():
     done = np.ones_like(reward, bool)
     _, scaled = scale_rewards(normalize.init_reward_scale(1), reward, done, np.float32(0.9))
     assert scaled[7, 0] == 10.0 and np.delete(scaled, 7).any() == 0
+
+
+def test_statistics_carried_over_weigh_as_much_as_documented():
+    """The first two of three entries are carried into four; then the new task's observations are taken in."""
+    known = update(normalize.init((3,)), rng.normal([5.0, -2.0, 9.0], [2.0, 0.5, 1.0], (4000, 3)).astype(np.float32))
+    carried = jax.jit(normalize.carry_over, static_argnums=(1, 2))(known, 2, 4)
+    mean, std = np.append(known.mean[:2], [0, 0]), np.append(known.std[:2], [1, 1])
+    np.testing.assert_array_equal(carried.mean, mean)
+    np.testing.assert_array_equal(carried.std, std)
+    x = rng.normal(1.0, 3.0, (500, 4)).astype(np.float32)
+    after = update(carried, x)
+    total = normalize.CARRIED + len(x)
+    new_mean = (normalize.CARRIED * mean + x.sum(axis=0)) / total
+    square = (normalize.CARRIED * (std**2 + mean**2) + np.square(x).sum(axis=0)) / total
+    np.testing.assert_allclose(after.mean, new_mean, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(after.std, np.sqrt(square - new_mean**2), rtol=1e-3)

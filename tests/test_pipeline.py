@@ -8,51 +8,27 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.experimental.compilation_cache import compilation_cache
 from orbax.checkpoint import v1 as ocp
 from PIL import Image
+from tiny_runs import CONFIG, PPO, KilledError, die, files_of, rows_of, tiny_steps
 
-from taic_jax import pipeline, stage
 from taic_jax.checkpoint import Checkpoints
-from taic_jax.config import CollectConfig, Config, ConfigError, EvaluateConfig, OptionsConfig, PPOConfig, TrainConfig
+from taic_jax.config import Config, ConfigError, TrainConfig
 from taic_jax.config_io import load_config
 from taic_jax.envs import make_env
 from taic_jax.experience import ExperienceStore, read_experience
-from taic_jax.logging import RunLogger, read_metrics
+from taic_jax.logging import RunLogger
 from taic_jax.options.dataset import Experience
 from taic_jax.pipeline import RunFolderError, run_pipeline
 from taic_jax.types import as_arrays
 
-PPO = PPOConfig(num_envs=2, rollout_length=8, epochs=1, minibatch_size=16, hidden_sizes=(4,))
-CONFIG = Config(
-    collect=CollectConfig(ticks=3 * 16, capacity=2 * 16, ppo=PPO),
-    options=OptionsConfig(length=2, size=2, hidden_size=4, mlp_sizes=(4,), steps=4, batch_size=8),
-    train=TrainConfig(ticks=3 * 16, ppo=PPO),
-    evaluate=EvaluateConfig(episodes=2, video_ticks=3),
-    seeds=2,
-)
 STAGES = {"collect": 3, "learn": 2, "train": 3}
 
 
 @pytest.fixture(scope="module", autouse=True)
-def tiny_steps(tmp_path_factory):
-    """Compile each program once for all runs here, save a checkpoint at every step, and log every second one."""
-    settings = {
-        "jax_compilation_cache_dir": str(tmp_path_factory.mktemp("compiled")),
-        "jax_persistent_cache_min_compile_time_secs": 0.0,
-        "jax_persistent_cache_min_entry_size_bytes": -1,
-    }
-    before = {name: getattr(jax.config, name) for name in settings}
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(stage, "CHECKPOINT_SECONDS", 0.0)
-        patch.setattr(pipeline, "STEPS_PER_LOG", 2)
-        for name, value in settings.items():
-            jax.config.update(name, value)
-        compilation_cache.reset_cache()
+def compiled_once(tmp_path_factory):
+    with tiny_steps(tmp_path_factory.mktemp("compiled")):
         yield
-    for name, value in before.items():
-        jax.config.update(name, value)
-    compilation_cache.reset_cache()
 
 
 @pytest.fixture(scope="module")
@@ -61,16 +37,6 @@ def finished(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("runs") / "finished"
     run_pipeline(CONFIG, folder)
     return folder
-
-
-def files_of(folder: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-
-
-def rows_of(folder: Path) -> list[dict]:
-    """Return the rows of the metrics in one order, without the time they were written."""
-    rows = [{**row, "time": None} for row in read_metrics(folder / "metrics.jsonl")]
-    return sorted(rows, key=lambda row: (row["stage"], row.get("ticks", row.get("steps")), sorted(row)))
 
 
 def last_states(folder: Path) -> dict[str, dict[str, np.ndarray]]:
@@ -135,23 +101,6 @@ def test_refuses_folders_that_are_not_its_own(finished, tmp_path):
     with pytest.raises(RunFolderError):
         run_pipeline(CONFIG, tmp_path / "thesis.txt", overwrite=True)
     assert (tmp_path / "thesis.txt").read_text() == "years of work"
-
-
-class KilledError(Exception):
-    """The process died here."""
-
-
-def die(monkeypatch, owner: type, method: str, count: int) -> None:
-    """Make the `count`-th call of a method from now on the last thing that happens."""
-    original, calls = getattr(owner, method), []
-
-    def dying(self, *args):
-        calls.append(args)
-        if len(calls) == count:
-            raise KilledError
-        return original(self, *args)
-
-    monkeypatch.setattr(owner, method, dying)
 
 
 def test_overwrites_a_run_when_asked(finished, tmp_path, monkeypatch):

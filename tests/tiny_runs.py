@@ -1,0 +1,100 @@
+"""Whole runs, as small as can be: their config, how to make them quick, and how to look at what they leave."""
+
+import contextlib
+import dataclasses
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+from jax.experimental.compilation_cache import compilation_cache
+from orbax.checkpoint import v1 as ocp
+
+from taic_jax import pipeline, stage
+from taic_jax.config import CollectConfig, Config, EvaluateConfig, OptionsConfig, PPOConfig, TrainConfig
+from taic_jax.logging import read_metrics
+
+PPO = PPOConfig(num_envs=2, rollout_length=8, epochs=1, minibatch_size=16, hidden_sizes=(4,))
+CONFIG = Config(
+    collect=CollectConfig(ticks=3 * 16, capacity=2 * 16, ppo=PPO),
+    options=OptionsConfig(length=2, size=2, hidden_size=4, mlp_sizes=(4,), steps=4, batch_size=8),
+    train=TrainConfig(ticks=3 * 16, ppo=PPO),
+    evaluate=EvaluateConfig(episodes=2, video_ticks=3),
+    seeds=2,
+)
+
+
+def with_fields(config: Config, **fields: Any) -> Config:
+    """Replace fields given by their dotted names, each dot written as two underscores."""
+    for name, value in fields.items():
+        config = _replace(config, name.split("__"), value)
+    return config
+
+
+def _replace(config: Any, path: list[str], value: Any) -> Any:
+    value = _replace(getattr(config, path[0]), path[1:], value) if path[1:] else value
+    return dataclasses.replace(config, **{path[0]: value})
+
+
+@contextlib.contextmanager
+def tiny_steps(cache: Path) -> Iterator[None]:
+    """Compile each program once for all runs here, save a checkpoint at every step, and log every second one."""
+    settings = {
+        "jax_compilation_cache_dir": str(cache),
+        "jax_persistent_cache_min_compile_time_secs": 0.0,
+        "jax_persistent_cache_min_entry_size_bytes": -1,
+    }
+    before = {name: getattr(jax.config, name) for name in settings}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(stage, "CHECKPOINT_SECONDS", 0.0)
+        patch.setattr(pipeline, "STEPS_PER_LOG", 2)
+        for name, value in settings.items():
+            jax.config.update(name, value)
+        compilation_cache.reset_cache()
+        yield
+    for name, value in before.items():
+        jax.config.update(name, value)
+    compilation_cache.reset_cache()
+
+
+class KilledError(Exception):
+    """The process died here."""
+
+
+def die(monkeypatch: pytest.MonkeyPatch, owner: type, method: str, count: int) -> None:
+    """Make the `count`-th call of a method from now on the last thing that happens."""
+    original, calls = getattr(owner, method), []
+
+    def dying(self, *args):
+        calls.append(args)
+        if len(calls) == count:
+            raise KilledError
+        return original(self, *args)
+
+    monkeypatch.setattr(owner, method, dying)
+
+
+def files_of(folder: Path) -> dict[str, bytes]:
+    """Return what every file under a folder holds."""
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def rows_of(folder: Path) -> list[dict]:
+    """Return the rows of the metrics in one order, without the time they were written."""
+    rows = [{**row, "time": None} for row in read_metrics(folder / "metrics.jsonl")]
+    return sorted(rows, key=lambda row: (row["stage"], row.get("ticks", row.get("steps")), sorted(row)))
+
+
+def last_state(folder: Path, stage: str) -> dict[str, np.ndarray]:
+    """Return the last checkpoint of a stage, array by array."""
+    steps = max(int(path.name) for path in (folder / "checkpoints" / stage).iterdir())
+    return ocp.load(folder / "checkpoints" / stage / str(steps))
+
+
+def assert_same_arrays(a: dict[str, np.ndarray], b: dict[str, np.ndarray]) -> None:
+    """Compare exactly."""
+    assert a.keys() == b.keys()
+    for name in a:
+        np.testing.assert_array_equal(a[name], b[name], err_msg=name)
