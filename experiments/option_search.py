@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from taic_jax.config import Config, ConfigError, validate, walk
+from taic_jax.config import Config, ConfigError, walk
 from taic_jax.config_io import closest, load_config
 from taic_jax.envs.base import Env
 from taic_jax.evaluate import evaluate
@@ -33,6 +33,7 @@ from taic_jax.pipeline import make_envs
 from taic_jax.rl import ppo
 from taic_jax.summary import commit
 from taic_jax.types import as_arrays
+from taic_jax.validation import validate
 
 FIELDS = (
     "task", "point", "seeds", "ticks", "untrained", "return", "mean_option", "duration", "kl_loss",

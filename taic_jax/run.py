@@ -17,8 +17,9 @@ from typing import Annotated, Any, get_type_hints
 
 import tyro
 
-from taic_jax.config import Config, ConfigError, validate, walk
+from taic_jax.config import Config, ConfigError, walk
 from taic_jax.config_io import closest, load_config, mistyped, preset_names, to_yaml
+from taic_jax.validation import validate
 
 DEFAULT_PRESET = "nav2d"
 PROGRAM = "python -m taic_jax.run"

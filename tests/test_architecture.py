@@ -17,7 +17,7 @@ ALL = PACKAGE + sorted((ROOT / "tests").rglob("*.py"))
 # A module imports only from its own layer or from earlier ones. A module that is in none fails the test.
 LAYERS = (
     "envs",
-    "config config_io types checkpoint",
+    "config validation config_io types checkpoint",
     "networks normalize returns",
     "options",
     "rl",

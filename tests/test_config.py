@@ -12,8 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from taic_jax import config as config_module
-from taic_jax.config import BOUNDS, CONFIG_CLASSES, Config, ConfigError, PPOConfig, validate, walk
+from taic_jax.config import CONFIG_CLASSES, Config, ConfigError, PPOConfig, walk
 from taic_jax.config_io import closest, load_config, to_yaml
+from taic_jax.validation import BOUNDS, validate
 
 
 def write(tmp_path: Path, text: str) -> Path:
