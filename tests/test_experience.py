@@ -72,7 +72,7 @@ def test_gathers_what_a_run_collected_for_its_own_body(tmp_path):
         # Seed 2 takes the run's seed 0.
         for seed, column in enumerate((0, 1, 0)):
             np.testing.assert_array_equal(gathered.obs[seed], block(0).obs[column])
-    with pytest.raises(ArtifactError, match="proprioception: expected 'point'.*got 'probe'"):
+    with pytest.raises(ArtifactError, match=r"proprioception: expected 'point'.*got 'probe'"):
         gather_experience(tmp_path, make_env("nav2d"), 1)
 
 
