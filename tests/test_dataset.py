@@ -149,6 +149,7 @@ def test_a_part_without_windows_contributes_none():
 
 def test_several_experiences_each_contribute_their_own_best():
     """The second is shorter, has fewer environments and rewards far below the first one's."""
+    config = dataclasses.replace(TOP, fraction=0.7)
     done = [np.zeros((T, B), bool), np.zeros((7, 2), bool)]
     done[1][3, 0] = True
     first = make_untied()
@@ -157,10 +158,10 @@ def test_several_experiences_each_contribute_their_own_best():
     second = Experience(
         second.obs.at[..., 1].add(1000.0), second.action + 1000.0, second.reward - 100.0, jnp.asarray(done[1])
     )
-    dataset = make([first, second], as_arrays(TOP))
-    expected = best(first, list(valid_starts(done[0])), TOP.fraction)
+    dataset = make([first, second], as_arrays(config))
+    expected = best(first, list(valid_starts(done[0])), config.fraction)
     starts = [(t, b) for t in range(7 - LENGTH) for b in range(2) if not done[1][t : t + LENGTH, b].any()]
-    expected |= {(t, 1000 + b) for t, b in best(second, starts, TOP.fraction)}
+    expected |= {(t, 1000 + b) for t, b in best(second, starts, config.fraction)}
     count = int(dataset.count)
     windows = gather_windows(dataset, jnp.arange(count), jnp.full(count, LENGTH), LENGTH)
     assert {tuple(map(int, states[0])) for states in windows.states} == expected and count == len(expected)
