@@ -99,11 +99,20 @@ def score(env: Env, config: Config, experience: Experience, key: jax.Array) -> d
 
 
 def search(arguments: Arguments, config: Config) -> list[dict[str, Any]]:
-    """Return a row per point of the grid."""
+    """Return a row per point of the grid.
+
+    Raises:
+      ConfigError: a point of the grid is no valid configuration.
+    """
     started = time.time()
     env, _ = make_envs(config)
     grid = parse_grid(arguments.grid)
     points = list(itertools.product(*grid.values()))
+    for point in points:
+        one = config
+        for name, value in zip(grid, point, strict=True):
+            one = replace(one, name, value)
+        validate(one)
     swept, axes = as_arrays(config), jax.tree.map(lambda _: None, as_arrays(config))
     for i, name in enumerate(grid):
         swept = replace(swept, name, jnp.array([point[i] for point in points], jnp.float32))
