@@ -203,3 +203,11 @@ def test_a_fixed_option_takes_no_noise():
         dataclasses.replace(CONFIG, termination="fixed"), ACTION_SIZE, random_model(CONFIG, STATE_SIZE, ACTION_SIZE)[1]
     )
     assert executor.termination == Fixed() and executor.noise_size == 0
+
+
+@pytest.mark.parametrize(("unit", "delta"), [("quantile", 1.0), ("error", 0.7)])
+def test_delta_is_the_models_as_a_quantile_and_the_configs_as_an_error(unit, delta):
+    config = dataclasses.replace(CONFIG, delta_unit=unit, delta=0.7)
+    _, model = random_model(config, STATE_SIZE, ACTION_SIZE)
+    executor = make_executor(config, ACTION_SIZE, model.replace(delta=jnp.ones(())))
+    np.testing.assert_allclose(executor.model.delta, delta)

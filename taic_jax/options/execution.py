@@ -116,6 +116,11 @@ class OptionExecutor(struct.PyTreeNode):
 
 
 def make_executor(config: OptionsConfig, action_size: int, model: OptionModel) -> OptionExecutor:
-    """Return the executor of an option model under the config's termination rule."""
+    """Return the executor of an option model under the config's termination rule.
+
+    Where delta is P's error itself, the config's is taken, so that it can be swept over one model.
+    """
+    if config.delta_unit == "error":
+        model = model.replace(delta=jnp.asarray(config.delta, jnp.float32))
     networks = make_networks(config, model.state_scale.mean.shape[-1], action_size)
     return OptionExecutor(model, networks, make_termination(config), config.length)
