@@ -8,11 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from probes import NO, Probe, assert_trees_equal, numbers
+from tiny_runs import CONFIG, KilledError, assert_same_arrays, die, last_state, tiny_steps, with_fields
 
+from taic_jax.artifacts import load_options
+from taic_jax.checkpoint import Checkpoints
 from taic_jax.config import FineTuneConfig, OptionsConfig, PPOConfig
-from taic_jax.envs import AutoReset
+from taic_jax.envs import AutoReset, make_env
 from taic_jax.options.execution import OptionExecutor, make_executor
 from taic_jax.options.model import OptionModel, Scale, init_params, make_networks
+from taic_jax.pipeline import run_pipeline
 from taic_jax.rl import fine_tune, ppo
 from taic_jax.rl.rollout import rollout
 from taic_jax.types import as_arrays
@@ -119,3 +123,27 @@ def test_options_fill_the_ticks_they_ran():
     decision = jnp.array([[False, True], [True, False], [False, False], [True, True]])
     filled = fine_tune.fill_options(option, decision, jnp.array([[-1.0], [-2.0]]))
     np.testing.assert_array_equal(filled[..., 0], [[-1, 1], [2, 1], [2, 1], [6, 7]])
+
+
+def test_a_run_fine_tunes_in_turns_and_goes_on_where_it_stopped(tmp_path, monkeypatch):
+    config = with_fields(
+        CONFIG, train__fine_tune=FineTuneConfig(every=1, learning_rate=0.01), train__ticks=4 * 16, train__baselines=()
+    )
+    with tiny_steps(tmp_path / "cache"):
+        whole = run_pipeline(config, tmp_path / "whole")
+        die(monkeypatch, Checkpoints, "save", 3 + 2 + 2)  # after collect's and learn's, in the last step of train
+        with pytest.raises(KilledError):
+            run_pipeline(config, tmp_path / "torn")
+        monkeypatch.undo()
+        resumed = run_pipeline(config, tmp_path / "torn", resume=True)
+    # Two steps of one iteration each of the policy and of D.
+    assert whole["ticks"] == 2 * (3 + 4) * 16
+    assert whole["methods"] == resumed["methods"]
+    assert_same_arrays(*(last_state(tmp_path / name, "train") for name in ("whole", "torn")))
+    learnt, tuned = (
+        load_options(tmp_path / "whole" / name, make_env("nav2d"), config.options, 2)
+        for name in ("options", "options_fine_tuned")
+    )
+    for name in learnt.params:
+        same = [(a == b).all() for a, b in zip(numbers(learnt.params[name]), numbers(tuned.params[name]), strict=True)]
+        assert all(same) == (name != "decoder")
