@@ -215,10 +215,13 @@ def main() -> None:
     tasks = arguments.tasks or (ARENAS if arguments.soak else envs.environment_names())
     rows = []
     for task in tasks:
+        has_engine = hasattr(envs.make_env(task).env, "physics")
+        if arguments.solver and not has_engine:
+            continue
         if arguments.solver:
             found = measure_solver(task, arguments.num_envs_mjx, arguments.length // 4)
         else:
-            engines = arguments.backends if hasattr(envs.make_env(task).env, "physics") else ("auto",)
+            engines = arguments.backends if has_engine else ("auto",)
             row_of = soak if arguments.soak else measure
             found = (row_of(arguments, task, backend) for backend in engines)
         for row in found:

@@ -138,13 +138,16 @@ def _draw(
 def _measure_delta(
     config: OptionsConfig, networks: Networks, dataset: Dataset, state: LearnState, key: Key[Array, ""]
 ) -> Float[Array, ""]:
-    """Return the quantile `config.delta` of P's errors on held-out windows, averaged over the latest steps."""
+    """Return the quantile `config.delta` of P's errors on held-out windows, averaged over the latest steps.
+
+    Without any such window it is NaN, which no error reaches.
+    """
     windows = _draw(config, dataset, key, dataset.count, dataset.held_out)
     model = as_model(state, dataset)
     encode = partial(apply, networks.encoder, state.params["encoder"])
     errors = partial(prefix_errors, networks, model)
     measured = jax.vmap(lambda window: errors(encode(window.actions)[0], window.states))(windows)
-    quantile = jnp.quantile(measured, config.delta)
+    quantile = jnp.where(dataset.held_out > 0, jnp.quantile(measured, config.delta), jnp.nan)
     return jnp.where(state.step == 0, quantile, state.delta + (quantile - state.delta) / DELTA_MEMORY)
 
 
