@@ -35,7 +35,10 @@ FLAT = ("strong", "weak")
 # Found by `experiments.option_search`, whose log is results/option_search.csv.
 VARIABLE = {"length": 10}
 # In closed loop D follows whatever gait it saw, so the best windows of the whole run serve; in open loop they do not.
-CLOSED = {"since": 0.0, "until": 1.0, "lambda_kl": 0.001, "lambda_pred": 0.3, "lambda_adv": 0.03}
+SETTINGS: dict[str, dict[str, float]] = {
+    "open": {"since": 0.2, "until": 0.5, "lambda_kl": 0.01, "lambda_pred": 1.0, "lambda_adv": 0.1},
+    "closed": {"since": 0.0, "until": 1.0, "lambda_kl": 0.001, "lambda_pred": 0.3, "lambda_adv": 0.03},
+}
 CONSTRAINTS: dict[str, dict[str, float]] = {
     "both": {},
     "none": {"lambda_pred": 0.0, "lambda_adv": 0.0},
@@ -94,8 +97,8 @@ def collector(arguments: Arguments, task: str, strength: str) -> Config:
 def cell(arguments: Arguments, task: str, rule: str, decoder: str, constraints: str) -> Config:
     """Return the config of one kind of options, learnt from the strong collector."""
     config = collector(arguments, task, "strong")
-    changes: dict[str, Any] = {"termination": rule, "decoder": decoder, **CONSTRAINTS[constraints]}
-    changes = (VARIABLE if rule != "fixed" else {}) | (CLOSED if decoder == "closed" else {}) | changes
+    changes: dict[str, Any] = {"termination": rule, "decoder": decoder} | SETTINGS[decoder] | CONSTRAINTS[constraints]
+    changes |= {} if rule == "fixed" else VARIABLE
     source = (str(arguments.run_dir / task / "strong"),)
     return dataclasses.replace(config, options=dataclasses.replace(config.options, experience=source, **changes))
 

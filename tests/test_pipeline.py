@@ -12,7 +12,7 @@ from orbax.checkpoint import v1 as ocp
 from PIL import Image
 from tiny_runs import CONFIG, PPO, KilledError, die, files_of, rows_of, tiny_steps
 
-from taic_jax import pipeline
+from taic_jax import pipeline, stage
 from taic_jax.checkpoint import Checkpoints
 from taic_jax.config import Config, ConfigError, TrainConfig
 from taic_jax.config_io import load_config
