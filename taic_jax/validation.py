@@ -64,6 +64,9 @@ def _check_options(options: OptionsConfig) -> None:
         raise _impossible("options.shortest", options.shortest, expected, options.length)
     if options.delta_unit == "quantile" and options.delta > 1:
         raise _impossible("options.delta", options.delta, "at most 1, being a quantile", 1.0)
+    if options.delta_unit == "quantile" and options.termination == "predict" and not options.steps:
+        expected = "error with options.steps 0, where no error of P was measured"
+        raise ConfigError(f"options.delta_unit: expected {expected}, got quantile; the nearest valid value is error")
     if options.since >= options.until:
         raise _impossible("options.since", options.since, f"less than options.until = {options.until}", 0.0)
 

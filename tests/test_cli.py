@@ -145,6 +145,11 @@ BAD_ARGUMENTS = {
         "options.length: expected",
         "train.ppo.rollout_length",
     ),
+    "quantile of nothing learnt": (
+        "--options.termination predict --options.steps 0",
+        "options.delta_unit: expected error with options.steps 0",
+        "nearest valid value is error",
+    ),
     "minibatch above rollout": (
         "half_cheetah --train.ppo.minibatch-size 99999",
         "train.ppo.minibatch_size",
