@@ -66,11 +66,15 @@ class Locomotion(Env):
             reward=zero,
             terminated=no,
             truncated=no,
-            metrics=jax.tree.map(jnp.zeros_like, metrics),
+            metrics=jax.tree.map(jnp.zeros_like, metrics | {"unstable": zero}),
         )
 
     def step(self, state: State, action: Float[Array, " A"]) -> State:
-        """Simulate one tick and pay for it."""
+        """Simulate one tick and pay for it.
+
+        Where the engine finds the simulation unstable, the robot stays where it was, the episode ends, and metric
+        `unstable` is 1.
+        """
         before, after = state.physics, self.physics.step(state.physics, action)
         finite = jnp.all(jnp.isfinite(jnp.concatenate([after.qpos, after.qvel])))
         after = self._advance(before, jax.tree.map(lambda new, old: jnp.where(finite, new, old), after, before))
@@ -81,7 +85,7 @@ class Locomotion(Env):
             reward=reward,
             terminated=~finite | ~self._is_healthy(after),
             truncated=jnp.zeros((), bool),
-            metrics=metrics,
+            metrics=metrics | {"unstable": (~finite).astype(jnp.float32)},
         )
 
     def render(self, physics: PhysicsState, *, height: int = 240, width: int = 320) -> np.ndarray:

@@ -17,7 +17,8 @@ import tyro
 
 from taic_jax.config import CollectConfig, Config, EnvConfig, EvaluateConfig, PPOConfig, TrainConfig
 from taic_jax.logging import RunLogger
-from taic_jax.pipeline import make_envs, prepare_folder, train_baseline
+from taic_jax.pipeline import make_envs, train_baseline
+from taic_jax.run_folder import prepare_folder
 from taic_jax.stage import CLOCK, Clock, Run
 from taic_jax.statistics import bootstrap_interval, iqm
 from taic_jax.summary import commit

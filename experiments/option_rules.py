@@ -23,7 +23,8 @@ from taic_jax.config import CollectConfig, Config, EvaluateConfig
 from taic_jax.config_io import load_config
 from taic_jax.experience import read_experience
 from taic_jax.logging import RunLogger
-from taic_jax.pipeline import collect, make_envs, prepare_folder, run_pipeline
+from taic_jax.pipeline import collect, make_envs, run_pipeline
+from taic_jax.run_folder import prepare_folder
 from taic_jax.stage import CLOCK, Clock, Run
 from taic_jax.statistics import bootstrap_interval, iqm, probability_of_improvement
 from taic_jax.summary import commit

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from taic_jax import normalize
-from taic_jax.checkpoint import ArtifactError, load_tree, save_tree
+from taic_jax.checkpoint import ArtifactError, load_tree, save_text, save_tree
 from taic_jax.config import OptionsConfig, PPOConfig
 from taic_jax.envs.base import Env
 from taic_jax.networks import PolicyParams
@@ -133,7 +133,7 @@ def _fit(
 
 def _save(folder: Path, tree: Any, description: dict[str, Any]) -> None:
     save_tree(folder, tree)
-    (folder / DESCRIPTION).write_text(json.dumps(description, indent=2) + "\n")
+    save_text(folder / DESCRIPTION, json.dumps(description, indent=2) + "\n")
 
 
 def _load(folder: Path, saved: int, seeds: int, empty: Any) -> Any:

@@ -5,6 +5,7 @@ is asked for before anything is read, and anyone can read it: Orbax's `load(path
 """
 
 import contextlib
+import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,11 +18,20 @@ from orbax.checkpoint import v1 as ocp
 
 Tree = TypeVar("Tree")
 
+PARTIAL = ".partial"
+"""Ending of a file that is not whole yet."""
 TEMPORARY = ".orbax-checkpoint-tmp"  # Orbax writes under this suffix, and renames when all is written
 
 
 class ArtifactError(ValueError):
     """Something on disk is not the tree of arrays that was asked for."""
+
+
+def save_text(path: Path, text: str) -> None:
+    """Write a text file, whole or not at all, in place of what was there."""
+    partial = path.with_name(path.name + PARTIAL)
+    partial.write_text(text)
+    os.replace(partial, path)
 
 
 def save_tree(path: Path, tree: Any) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Key
 
 from taic_jax.artifacts import DESCRIPTION, read_description
-from taic_jax.checkpoint import ArtifactError
+from taic_jax.checkpoint import ArtifactError, save_text
 from taic_jax.config import CollectConfig
 from taic_jax.demonstrations import read_demonstrations
 from taic_jax.envs.base import Env
@@ -91,7 +91,7 @@ class ExperienceStore:
     def __init__(self, folder: Path, capacity: int, description: dict):
         self.folder, self.capacity = folder, capacity
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / "description.json").write_text(json.dumps(description, indent=2) + "\n")
+        save_text(folder / DESCRIPTION, json.dumps(description, indent=2) + "\n")
 
     def write(self, iteration: int, block: Experience) -> None:
         """Save the block of one iteration, atomically, and drop the block that no longer fits."""

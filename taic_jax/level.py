@@ -13,6 +13,7 @@ from taic_jax.config import FineTuneConfig, PPOConfig
 from taic_jax.envs.base import Env
 from taic_jax.evaluate import evaluate
 from taic_jax.experience import as_experience
+from taic_jax.guard import earliest
 from taic_jax.options.dataset import Experience
 from taic_jax.options.execution import Executor
 from taic_jax.options.model import OptionModel
@@ -90,7 +91,8 @@ class FineTunedLevel(Level):
         one = partial(ppo.iterate, self.config, self.env, executor, count)
         policy, metrics = jax.lax.scan(lambda s, _: one(s)[:2], policy, None, self.fine_tune.every)
         policy, tuned, told = fine_tune.iterate(self.config, self.fine_tune, self.env, learnt, policy, tuned)
-        return (policy, tuned), jax.tree.map(lambda x: x[-1], metrics) | told, None
+        nonfinite = earliest(jnp.append(metrics["nonfinite"], told["nonfinite"]))
+        return (policy, tuned), jax.tree.map(lambda x: x[-1], metrics) | told | {"nonfinite": nonfinite}, None
 
     def agent(self, state: Any, *model: OptionModel) -> ppo.Agent:
         """Return what acts: the policy over the fine-tuned options."""

@@ -7,7 +7,6 @@ are dropped from the one, and the other is drawn again.
 import contextlib
 import json
 import math
-import os
 import shutil
 import time
 from collections.abc import Iterator, Mapping
@@ -18,6 +17,8 @@ import numpy as np
 import tensorboardX
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+
+from taic_jax.checkpoint import save_text
 
 Row = dict[str, Any]
 Unit = Literal["ticks", "steps"]
@@ -96,9 +97,7 @@ class RunLogger:
             return
         self._close()
         shutil.rmtree(self._events_dir, ignore_errors=True)
-        partial = self._path.with_suffix(".partial")
-        partial.write_text("".join(json.dumps(row) + "\n" for row in kept))
-        os.replace(partial, self._path)
+        save_text(self._path, "".join(json.dumps(row) + "\n" for row in kept))
         self._open()
         for row in kept:
             self._write_events(row)
@@ -114,7 +113,7 @@ class RunLogger:
     def _write_events(self, row: Row) -> None:
         for name, value in row.items():
             if isinstance(value, list) and value and isinstance(value[0], list):
-                self._write_histogram(name, np.sum(value, axis=0), row)
+                self._write_histogram(name, np.nansum(np.array(value, float), axis=0), row)
             elif "/" in name and (mean := _mean(value)) is not None:
                 self._events.add_scalar(name, mean, _count(row), walltime=row["time"])
 

@@ -8,6 +8,7 @@ import dataclasses
 import io
 import itertools
 import os
+import signal
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -19,10 +20,13 @@ import tyro
 
 from taic_jax.config import Config, ConfigError, walk
 from taic_jax.config_io import closest, load_config, mistyped, preset_names, to_yaml
+from taic_jax.interruption import Interrupted, Signals
 from taic_jax.validation import validate
 
 DEFAULT_PRESET = "nav2d"
 PROGRAM = "python -m taic_jax.run"
+FAILED = 1
+EXIT_CODES: dict[int, int] = {signal.SIGINT: 130, signal.SIGTERM: 75}
 
 
 @dataclass(frozen=True)
@@ -39,17 +43,25 @@ class Command:
     """Replace the run in --run-dir."""
     dry_run: tyro.conf.FlagCreatePairsOff[bool] = False
     """Print the configuration and the plan, and stop."""
+    checkpoint_seconds: float = 30.0
+    """Least seconds between two checkpoints of a stage; 0 makes one every iteration."""
+    replay: Annotated[Path | None, tyro.conf.arg(metavar="DUMP")] = None
+    """Take the step again at which a seed stopped, from the state that the run left under dumps, and stop."""
     options: Annotated[str, tyro.conf.arg(metavar="RUN")] = ""
     """Run or artifact whose option model is used as it is; short for --options.source."""
     config: Annotated[Config, tyro.conf.arg(name=""), tyro.conf.FlagConversionOff] = Config()
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Run one command and return its exit code: 0, 2 for a mistake of the user, or 130 when interrupted."""
+    """Run one command and return its exit code.
+
+    It is 0, or 2 for a mistake of the user; a run that was told to stop and saved what it had done gives 130 after
+    SIGINT (Ctrl-C) and 75, the system's "try again", after SIGTERM; one whose every seed diverged gives 1.
+    """
     try:
-        execute(parse(sys.argv[1:] if args is None else args))
-    except KeyboardInterrupt as stop:
-        print("taic_jax: interrupted;", *stop.args, file=sys.stderr)
+        return execute(parse(sys.argv[1:] if args is None else args))
+    except KeyboardInterrupt:
+        print("taic_jax: interrupted", file=sys.stderr)
         return 130
     except BrokenPipeError:  # the reader, such as head, has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -78,6 +90,8 @@ def parse(args: Sequence[str]) -> Command:
         command = _parse_over(args, str(own)) if own.is_file() else command
     elif command.source != first:
         command = _parse_over(args, command.source)
+    if not command.checkpoint_seconds >= 0:
+        raise ConfigError(f"--checkpoint-seconds: expected at least 0, got {command.checkpoint_seconds}")
     if command.options:
         options = dataclasses.replace(command.config.options, source=command.options)
         command = dataclasses.replace(command, config=dataclasses.replace(command.config, options=options))
@@ -85,22 +99,40 @@ def parse(args: Sequence[str]) -> Command:
     return command
 
 
-def execute(command: Command) -> None:
-    """Run the experiment, or only print its configuration and plan."""
+def execute(command: Command) -> int:
+    """Run the experiment, or only print its configuration and plan; return the exit code."""
+    if command.replay:
+        from taic_jax.replay import replay
+
+        found = replay(command.replay)
+        print(found or f"{command.replay}: all numbers were finite this time")
+        return 0 if found else FAILED
     from taic_jax.pipeline import make_envs, run_pipeline
+    from taic_jax.stage import DivergedError
     from taic_jax.summary import plan
 
     if command.dry_run:
         print(to_yaml(command.config))
         print(plan(command.config, *make_envs(command.config)))
-        return
+        return 0
     name = f"{Path(command.source).stem}-{time.strftime('%Y%m%d-%H%M%S')}"
     run_dir = command.run_dir or Path("runs") / name
     try:
-        run_pipeline(command.config, run_dir, resume=command.resume, overwrite=command.overwrite)
-    except KeyboardInterrupt:
-        raise KeyboardInterrupt(f"--resume --run-dir {run_dir} continues from the last checkpoint") from None
+        with Signals() as signals:
+            run_pipeline(
+                command.config, run_dir, resume=command.resume, overwrite=command.overwrite,
+                signals=signals, checkpoint_seconds=command.checkpoint_seconds,
+            )  # fmt: skip
+    except (Interrupted, KeyboardInterrupt) as stop:
+        received = stop.received if isinstance(stop, Interrupted) else signal.SIGINT
+        name = signal.Signals(received).name
+        print(f"taic_jax: stopped by {name}; --resume --run-dir {run_dir} goes on", file=sys.stderr)
+        return EXIT_CODES[received]
+    except DivergedError as error:
+        print(f"taic_jax: error: {error}", file=sys.stderr)
+        return FAILED
     print(run_dir / "summary.json")
+    return 0
 
 
 def _parse_over(args: Sequence[str], source: str) -> Command:

@@ -1,23 +1,31 @@
 """What every stage of the main job is driven by: compile once, step, log, checkpoint, resume."""
 
 import json
+import sys
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 
-from taic_jax.checkpoint import Checkpoints
+from taic_jax.checkpoint import Checkpoints, save_text, save_tree
 from taic_jax.config import Config
+from taic_jax.guard import FINITE, QUANTITIES, Guarded, begin, guarded
+from taic_jax.interruption import Signals
 from taic_jax.logging import RunLogger
 
 S = TypeVar("S")
+
 STAGES = ("collect", "learn", "train", "flat", "evaluate", "video", "repeat", "total", "transfer")
+BUILDS_ON = {"learn": ("collect",), "train": ("collect", "learn")}
+"""What a stage starts from: a seed that stopped there stays stopped."""
 CHECKPOINT_SECONDS = 30.0
-CLOCK = "clock.json"
+CLOCK, DUMPS = "clock.json", "dumps"
 
 
 @dataclass
@@ -30,7 +38,7 @@ class Clock:
 
     def save(self, path: Path) -> None:
         """Write to a JSON file, so that a resumed run counts on."""
-        path.write_text(json.dumps(asdict(self)) + "\n")
+        save_text(path, json.dumps(asdict(self)) + "\n")
 
     @classmethod
     def load(cls, path: Path) -> "Clock":
@@ -38,19 +46,63 @@ class Clock:
         return cls(**json.loads(path.read_text())) if path.exists() else cls()
 
 
+class DivergedError(ArithmeticError):
+    """No seed is left whose numbers are finite."""
+
+
+class Stopped(NamedTuple):
+    """Of one stage, for every seed: `FINITE`, or why it stopped, and what it had done by then, in the logs' unit."""
+
+    code: np.ndarray
+    after: np.ndarray
+
+
 @dataclass(frozen=True)
 class Run:
-    """What every stage needs: the config with array leaves, one key per seed, where to write."""
+    """What every stage needs: the config with array leaves, one key per seed, where to write, when to stop."""
 
     config: Config
     keys: jax.Array
     dir: Path
     logger: RunLogger
     clock: Clock
+    signals: Signals = field(default_factory=Signals)
+    checkpoint_seconds: float = field(default_factory=lambda: CHECKPOINT_SECONDS)
+    stopped: dict[str, Stopped] = field(default_factory=dict)
 
     def stage_keys(self, stage: str) -> jax.Array:
         """Return the seeds' keys [K] of one stage; a seed's key does not depend on the number of seeds."""
         return jax.vmap(partial(jax.random.fold_in, data=STAGES.index(stage)))(self.keys)
+
+    def inherited(self, stage: str) -> jax.Array:
+        """Return the codes [K] of the seeds that stopped in what this stage builds on."""
+        codes = [jnp.full(len(self.keys), FINITE, jnp.int32)]
+        codes += [jnp.asarray(self.stopped[name].code) for name in BUILDS_ON.get(stage, ()) if name in self.stopped]
+        return jnp.stack(codes).max(axis=0)
+
+    def stop(self, stage: str, guard: Guarded, unit: int, known: np.ndarray | None = None) -> np.ndarray:
+        """Note which seeds have stopped, dump and tell those that `known` does not have yet, and return the codes [K].
+
+        Raises:
+          DivergedError: none goes on.
+        """
+        codes, steps = jax.device_get((guard.code, guard.step))
+        self.stopped[stage] = Stopped(codes, steps * unit)
+        for seed in np.flatnonzero(codes != known) if known is not None else ():
+            folder = self.dir / DUMPS / f"{stage}-{steps[seed] * unit}-seed{seed}"
+            told = {"stage": stage, "seed": int(seed), "seeds": len(codes), "step": int(steps[seed])}
+            told |= {"after": int(steps[seed] * unit), "quantity": QUANTITIES[codes[seed]]}
+            save_tree(folder, jax.tree.map(lambda x, k=seed: x[k], guard.state))
+            save_text(folder / "description.json", json.dumps(told, indent=2) + "\n")
+            print(
+                f"taic_jax: seed {seed} stopped in {stage} after {told['after']:,}: its {told['quantity']} is not "
+                f"finite; --replay {folder} shows it again",
+                file=sys.stderr,
+            )
+        if (codes != FINITE).all():
+            where = self.dir / DUMPS
+            raise DivergedError(f"{stage}: every seed has stopped, at numbers that are not finite: see {where}")
+        return codes
 
     def compile(self, function: Callable, *args: Any, donate: bool = False) -> Callable:
         """Compile ahead of time, so that a call of other shapes or types fails instead of compiling again."""
@@ -73,36 +125,50 @@ def drive(
 ) -> S:
     """Take `num_steps` steps, from the stage's last checkpoint on, logging each.
 
+    A seed whose numbers are not finite stops at its last good state, which is also dumped; the others go on.
+
     Args:
-      run: the run.
+      run: the run; its `stopped` is told of the seeds that did not get through.
       stage: its name.
-      step: (state, *args) -> (state, metrics [K], what `after` is told).
+      step: (states [K], *args) -> (states, metrics [K] with the codes `nonfinite`, what `after` is told).
       state: before the first step; consumed.
       *args: arrays that stay the same.
       num_steps: in all.
       unit: what a step counts for in logs: ticks per seed, or gradient steps.
       ticks: interactions a step costs over all seeds.
       after: called with the step's index and the third result.
+
+    Raises:
+      Interrupted: a signal was received; the step that was being taken is finished and saved.
+      DivergedError: every seed has stopped.
     """
     checkpoints = Checkpoints(run.dir / "checkpoints" / stage)
+    guard = begin(state, run.inherited(stage))
     first = checkpoints.latest_step() or 0
     if first:
-        state = checkpoints.load(first, state)
+        guard = checkpoints.load(first, guard)
     run.logger.truncate(stage, first * unit)
+    known = run.stop(stage, guard, unit)
     if first == num_steps:
-        return state
-    compiled = run.compile(step, state, *args, donate=True)
+        return guard.state
+    compiled = run.compile(guarded(step), guard, *args, donate=True)
     saved = time.perf_counter()
     with run.logger.stage(stage, num_steps * unit, done=first * unit):
         for index in range(first, num_steps):
-            state, metrics, extra = compiled(state, *args)
-            run.logger.log(stage, (index + 1) * unit, jax.device_get(metrics), "ticks" if ticks else "steps")
+            guard, metrics, extra = compiled(guard, *args)
+            metrics, codes = jax.device_get((metrics, guard.code))
+            run.logger.log(stage, (index + 1) * unit, metrics, "ticks" if ticks else "steps")
             if after is not None:
                 after(index, extra)
             run.clock.ticks += ticks
-            if time.perf_counter() - saved > CHECKPOINT_SECONDS or index + 1 == num_steps:
-                checkpoints.save(index + 1, state)
+            changed = (codes != known).any()
+            if changed:
+                known = run.stop(stage, guard, unit, known)
+            due = time.perf_counter() - saved > run.checkpoint_seconds or index + 1 == num_steps
+            if due or changed or run.signals.received:
+                checkpoints.save(index + 1, guard)
                 run.clock.run += time.perf_counter() - saved
                 run.clock.save(run.dir / CLOCK)
                 saved = time.perf_counter()
-    return state
+            run.signals.check()
+    return guard.state

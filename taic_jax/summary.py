@@ -13,8 +13,9 @@ from taic_jax.config import COLLECT, Config, collector_is_baseline, needs_collec
 from taic_jax.envs.base import Env
 from taic_jax.evaluate import record
 from taic_jax.experience import experience_bytes
+from taic_jax.guard import FINITE, QUANTITIES
 from taic_jax.rl.ppo import Agent, num_iterations
-from taic_jax.stage import Run
+from taic_jax.stage import Run, Stopped
 from taic_jax.statistics import summarize
 
 PACKAGES = ("taic_jax", "jax", "jaxlib", "flax", "optax", "brax", "mujoco", "mujoco-mjx", "orbax-checkpoint")
@@ -60,9 +61,18 @@ def as_summary(run: Run, methods: Mapping[str, Mapping[str, Any]]) -> dict[str, 
         "ticks": clock.ticks,
         "ticks_per_second": clock.ticks / clock.run if clock.run else None,
         "seconds": {"compile": clock.compile, "run": clock.run},
+        "stopped": {stage: _stopped(seeds) for stage, seeds in run.stopped.items() if (seeds.code != FINITE).any()},
         "methods": {name: _method(**evaluations) for name, evaluations in methods.items()},
         "versions": {name: _version(name) for name in PACKAGES},
         "commit": commit(),
+    }
+
+
+def _stopped(seeds: Stopped) -> dict[str, dict[str, Any]]:
+    """Return, for each seed that stopped in a stage, why and after how many ticks or gradient steps."""
+    return {
+        str(seed): {"quantity": QUANTITIES[seeds.code[seed]], "after": int(seeds.after[seed])}
+        for seed in np.flatnonzero(seeds.code != FINITE)
     }
 
 

@@ -17,14 +17,15 @@ ALL = PACKAGE + sorted((ROOT / "tests").rglob("*.py"))
 # A module imports only from its own layer or from earlier ones. A module that is in none fails the test.
 LAYERS = (
     "envs",
-    "config validation config_io types checkpoint",
-    "networks normalize returns",
+    "config validation config_io types checkpoint run_folder",
+    "networks normalize returns guard",
     "options",
     "rl",
     "experience evaluate statistics artifacts demonstrations measures option_space",
-    "logging sweep level",
+    "logging interruption level",
     "stage summary",
     "pipeline",
+    "replay",
     "run",
     "experiments",
 )

@@ -2,6 +2,7 @@
 
 import dataclasses
 import inspect
+import signal
 import subprocess
 import sys
 import types
@@ -13,6 +14,7 @@ from taic_jax import run
 from taic_jax.checkpoint import ArtifactError
 from taic_jax.config import CONFIG_CLASSES, Config, ConfigError
 from taic_jax.config_io import load_config, to_yaml
+from taic_jax.interruption import Interrupted
 from taic_jax.run import main, parse
 
 
@@ -26,7 +28,7 @@ def pipeline(monkeypatch):
     """Stand in for the pipeline, and record what it is asked to run."""
     calls = []
 
-    def run_pipeline(config, run_dir, *, resume, overwrite):
+    def run_pipeline(config, run_dir, *, resume, overwrite, signals, checkpoint_seconds):
         calls.append((config, run_dir, resume, overwrite))
 
     fake = types.SimpleNamespace(run_pipeline=run_pipeline, make_envs=lambda config: ("env", "source"))
@@ -192,9 +194,10 @@ def test_errors_of_the_program_keep_their_traceback(monkeypatch):
         main([])
 
 
-def test_interrupt_exits_130_and_tells_how_to_continue(pipeline, monkeypatch, capsys):
+@pytest.mark.parametrize("stop", [KeyboardInterrupt(), Interrupted(signal.SIGINT)])
+def test_interrupt_exits_130_and_tells_how_to_continue(pipeline, monkeypatch, capsys, stop):
     module = sys.modules["taic_jax.pipeline"]
-    monkeypatch.setattr(module, "run_pipeline", lambda *args, **kwargs: (_ for _ in ()).throw(KeyboardInterrupt))
+    monkeypatch.setattr(module, "run_pipeline", lambda *args, **kwargs: (_ for _ in ()).throw(stop))
     assert main(["--run-dir", "mine"]) == 130
     err = capsys.readouterr().err
     assert err.count("\n") == 1 and "--resume --run-dir mine" in err
@@ -225,6 +228,7 @@ def test_every_field_has_help():
 
 
 PARSE_WITHOUT_JAX = """
+import signal
 import sys
 from taic_jax import run
 run.execute = lambda command: print(sorted({"jax", "mujoco"} & sys.modules.keys()), command.config.seed)

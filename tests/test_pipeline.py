@@ -20,7 +20,8 @@ from taic_jax.envs import make_env
 from taic_jax.experience import ExperienceStore, read_experience
 from taic_jax.logging import RunLogger
 from taic_jax.options.dataset import Experience
-from taic_jax.pipeline import RunFolderError, run_pipeline
+from taic_jax.pipeline import run_pipeline
+from taic_jax.run_folder import RunFolderError
 from taic_jax.types import as_arrays
 
 STAGES = {"collect": 3, "learn": 2, "train": 3}
@@ -53,7 +54,8 @@ def methods_of(folder: Path) -> dict:
 def test_leaves_a_whole_run_behind(finished):
     assert load_config(finished / "config.yaml") == CONFIG
     summary = json.loads((finished / "summary.json").read_text())
-    assert set(summary) == {"ticks", "ticks_per_second", "seconds", "methods", "versions", "commit"}
+    assert set(summary) == {"ticks", "ticks_per_second", "seconds", "stopped", "methods", "versions", "commit"}
+    assert summary["stopped"] == {}
     assert summary["ticks"] == 2 * (48 + 48) and summary["ticks_per_second"] > 0
     assert set(summary["seconds"]) == {"compile", "run"} and summary["versions"]["jax"] == jax.__version__
     assert set(summary["methods"]) == {"flat", "taic"}

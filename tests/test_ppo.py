@@ -17,7 +17,7 @@ from taic_jax.config import PPOConfig
 from taic_jax.networks import Policy, PolicyParams
 from taic_jax.options.execution import IdentityExecutor
 from taic_jax.returns import semi_markov_advantages
-from taic_jax.rl import ppo
+from taic_jax.rl import ppo, update
 from taic_jax.rl.rollout import Rollout
 from taic_jax.types import as_arrays
 
@@ -38,9 +38,9 @@ def test_loss_by_hand():
     advantage = jnp.array([2.0, -2.0, 2.0, -2.0, 1.0])
     option = jnp.array([[0.0], [1.0], [2.0], [-1.0], [0.5]])
     log_prob = -0.5 * option[:, 0] ** 2 - 0.5 * math.log(2 * math.pi)
-    decisions = ppo.Decisions(jnp.zeros((5, 1)), option, log_prob - jnp.log(ratio), advantage, jnp.arange(5.0))
+    decisions = update.Decisions(jnp.zeros((5, 1)), option, log_prob - jnp.log(ratio), advantage, jnp.arange(5.0))
     config = as_arrays(PPOConfig(clip=0.2, value_weight=0.5, entropy_weight=0.1))
-    loss, terms = jax.jit(ppo.ppo_loss, static_argnums=1)(params, policy, decisions, jnp.full(5, 0.2), config)
+    loss, terms = jax.jit(update.ppo_loss, static_argnums=1)(params, policy, decisions, jnp.full(5, 0.2), config)
     # min(ratio A, clipped A): 1.2 * 2, 1.5 * -2, 0.5 * 2, 0.8 * -2, 1.1 * 1; sum -0.1, mean -0.02.
     policy_loss = 0.02
     value_loss = 0.5 * (0 + 1 + 4 + 9 + 16) / 5
@@ -90,9 +90,9 @@ def plain_update(
     )  # fmt: skip
     target, advantage = (advantage + value)[rows], advantage[rows]
     advantage = (advantage - advantage.mean()) / advantage.std()
-    decisions = ppo.Decisions(obs[rows], ticks.option[rows], ticks.log_prob[rows], advantage, target)
+    decisions = update.Decisions(obs[rows], ticks.option[rows], ticks.log_prob[rows], advantage, target)
     weight = jnp.full(len(advantage), 1.0 / len(advantage))
-    gradient, terms = jax.grad(ppo.ppo_loss, has_aux=True)(state.params, policy, decisions, weight, config)
+    gradient, terms = jax.grad(update.ppo_loss, has_aux=True)(state.params, policy, decisions, weight, config)
     adam = optax.chain(optax.clip_by_global_norm(0.5), optax.adam(ONE_STEP.learning_rate, eps=1e-5))
     with jax.numpy_dtype_promotion("standard"):
         updates, _ = adam.update(gradient, adam.init(state.params))
@@ -105,7 +105,7 @@ def test_an_iteration_is_the_plain_update_on_its_decisions(iterate, first_state)
     rows = np.nonzero(np.asarray(ticks.decision))
     params, terms = plain_update(first_state, state.running.env.obs, ticks, rows)
     assert_trees_equal(state.params, params, rtol=1e-4, atol=1e-6)
-    assert_trees_equal([metrics[name] for name in ppo.LOSSES], list(terms), rtol=1e-4, atol=1e-6)
+    assert_trees_equal([metrics[name] for name in update.LOSSES], list(terms), rtol=1e-4, atol=1e-6)
 
 
 def test_the_first_pass_sees_the_policy_that_acted(iterate, first_state):
@@ -150,13 +150,13 @@ def pairs(a: jax.Array, b: jax.Array) -> list[tuple[float, float]]:
 
 
 def test_every_decision_is_used_once_an_epoch_and_nothing_else(monkeypatch, first_state):
-    minibatches, true_loss = [], ppo.ppo_loss
+    minibatches, true_loss = [], update.ppo_loss
 
     def spy(params, policy, batch, weight, config):
         jax.debug.callback(lambda *x: minibatches.append(x), batch.option[:, 0], batch.log_prob, weight)
         return true_loss(params, policy, batch, weight, config)
 
-    monkeypatch.setattr(ppo, "ppo_loss", spy)
+    monkeypatch.setattr(update, "ppo_loss", spy)
     config = as_arrays(dataclasses.replace(ONE_STEP, epochs=2, minibatch_size=5))
     _, _, ticks = jax.jit(partial(ppo.iterate, config, ENV, EXECUTOR, ITERATIONS))(first_state)
     jax.effects_barrier()

@@ -16,6 +16,7 @@ from jaxtyping import Float
 
 from taic_jax.envs.base import PhysicsState
 from taic_jax.envs.physics.base import Physics
+from taic_jax.envs.physics.watchdog import Watchdog
 
 # What a call sends, in the order of MuJoCo's state rows, where only the time precedes it.
 _SENT = (
@@ -30,6 +31,12 @@ _DIVERGED = [
     mujoco.mjtWarning.mjWARN_BADQVEL.value,
     mujoco.mjtWarning.mjWARN_BADQACC.value,
 ]
+PATIENCE = 60.0
+"""Seconds after which a call that has not returned is told; the longest of ours take a tenth of one."""
+LATE = (
+    f"the physics has not returned for {PATIENCE:.0f} s. If it never does: end the process (kill -9), go on from the "
+    "last checkpoint (--resume), and should it happen again, step with one thread (--env.num-threads 1)"
+)
 
 
 class MujocoPhysics(Physics):
@@ -56,6 +63,7 @@ class MujocoPhysics(Physics):
         super().__init__(model, substeps)
         self.num_threads = num_threads or num_physical_cores()
         self._lock = threading.Lock()
+        self._watchdog = Watchdog(PATIENCE, LATE)
         self._batches: dict[int, tuple[mujoco.batch.Batch, np.ndarray]] = {}
 
     def step(self, state: PhysicsState, ctrl: Float[Array, " nu"]) -> PhysicsState:
@@ -86,7 +94,8 @@ class MujocoPhysics(Physics):
         with self._lock:
             batch, rows = self._batch(len(sent))
             rows[...] = sent
-            batch.step(nstep=self.substeps)
+            with self._watchdog:
+                batch.step(nstep=self.substeps)
             after[...] = rows[:, : after.shape[-1]]
             if batch.warning.any():  # [simulations, kinds, (last info, count)]
                 after[batch.warning[:, _DIVERGED, 1].any(axis=1)] = np.nan

@@ -11,6 +11,7 @@ from flax import struct
 from jaxtyping import Array, Float, Int, Key
 
 from taic_jax.config import OptionsConfig
+from taic_jax.guard import earliest, first_nonfinite
 from taic_jax.networks import apply
 from taic_jax.options.dataset import Dataset, Experience, Window, gather, make_dataset
 from taic_jax.options.losses import adversarial_loss, end_loss, gradient_reversal, kl_loss, reconstruction_loss
@@ -119,6 +120,10 @@ def step(
     with jax.numpy_dtype_promotion("standard"):  # Optax raises a float to an integer power
         updates, optimizer = make_optimizer(config).update(gradient, state.optimizer)
     params: Any = optax.apply_updates(state.params, updates)
+    nonfinite = first_nonfinite(
+        window=(windows.states, windows.actions), loss=list(losses.values()), gradient=(params, optimizer)
+    )
+    losses = losses | {"nonfinite": nonfinite}
     if config.termination == "predict":
         losses = losses | {"delta": state.delta}
     return LearnState(params, optimizer, state.delta, key, state.step + 1), losses
@@ -154,9 +159,10 @@ def _measure_delta(
 def steps(
     config: OptionsConfig, networks: Networks, count: int, state: LearnState, dataset: Dataset
 ) -> tuple[LearnState, dict[str, Array], None]:
-    """Take `count` gradient steps and return the mean losses."""
+    """Take `count` gradient steps and return the mean losses, and the earliest of the codes `nonfinite`."""
     state, losses = jax.lax.scan(lambda s, _: step(config, networks, dataset, s), state, None, count)
-    return state, jax.tree.map(jnp.mean, losses), None
+    nonfinite = earliest(losses.pop("nonfinite"))
+    return state, jax.tree.map(jnp.mean, losses) | {"nonfinite": nonfinite}, None
 
 
 def as_model(state: LearnState, dataset: Dataset) -> OptionModel:

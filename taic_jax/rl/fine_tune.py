@@ -17,6 +17,7 @@ from taic_jax import normalize
 from taic_jax.config import FineTuneConfig, PPOConfig
 from taic_jax.envs.base import Env
 from taic_jax.envs.wrappers import AutoReset
+from taic_jax.guard import first_nonfinite
 from taic_jax.networks import apply
 from taic_jax.options.execution import Decoding, OptionExecutor
 from taic_jax.returns import semi_markov_advantages
@@ -158,7 +159,10 @@ def iterate(
     learnt = executor.model.params["decoder"]
     step = partial(_epoch, config, fine, executor, learnt, rows)
     tuned, losses = jax.lax.scan(step, tuned, jax.random.split(key_update, config.epochs))
-    metrics = {"decoder_loss": jnp.mean(losses[0]), "decoder_kl": losses[1][-1, -1]}
+    nonfinite = first_nonfinite(
+        action=ticks.action, observation=(ticks.obs, ticks.final_obs), reward=ticks.reward, loss=losses, gradient=tuned
+    )
+    metrics = {"decoder_loss": jnp.mean(losses[0]), "decoder_kl": losses[1][-1, -1], "nonfinite": nonfinite}
     return state.replace(running=running, key=key), tuned, metrics
 
 

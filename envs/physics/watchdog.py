@@ -1,0 +1,51 @@
+"""Say so when a call into the engine does not return, instead of hanging in silence."""
+
+import sys
+import threading
+import time
+import weakref
+
+
+class Watchdog:
+    """A context around a call; a call that takes longer than `limit` seconds is told on standard error, once.
+
+    One thread looks on from the first call until the watchdog is no longer used. It costs a call two assignments.
+
+    Args:
+      limit: in seconds.
+      message: what to say.
+    """
+
+    def __init__(self, limit: float, message: str):
+        self.limit, self.message = limit, message
+        self._since: float | None = None
+        self._thread: threading.Thread | None = None
+
+    def __enter__(self) -> None:
+        self._since = time.monotonic()
+        if self._thread is None:
+            self._thread = threading.Thread(target=_look_on, args=(weakref.ref(self), self.limit / 4), daemon=True)
+            self._thread.start()
+
+    def __exit__(self, *_: object) -> None:
+        self._since = None
+
+    def late(self, told: float | None) -> float | None:
+        """Return when the running call began if it is late, having told of it unless that is `told`."""
+        since = self._since
+        if since is None or time.monotonic() - since < self.limit:
+            return None
+        if since != told:
+            print(f"taic_jax: {self.message}", file=sys.stderr, flush=True)
+        return since
+
+
+def _look_on(watchdog: "weakref.ref[Watchdog]", interval: float) -> None:
+    told = None
+    while True:
+        time.sleep(interval)
+        watched = watchdog()
+        if watched is None:
+            return
+        told = watched.late(told)
+        del watched  # or it would never be collected

@@ -1,0 +1,156 @@
+"""Kill runs at random moments, resume them, and compare each with a run that was left alone, bit by bit.
+
+python -m taic_jax.experiments.kills --kills 50
+
+Each run is killed once by SIGKILL, at a moment drawn uniformly over the length of a whole run, start and compilation
+included. Compiled programs are kept in a cache, so that a run is mostly what is tested.
+"""
+
+import dataclasses
+import json
+import os
+import random
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+
+from taic_jax.config import CollectConfig, Config, EnvConfig, EvaluateConfig, OptionsConfig, PPOConfig, TrainConfig
+from taic_jax.config_io import to_yaml
+from taic_jax.logging import read_metrics
+
+STAGES = ("start", "collect", "learn", "train", "end")
+SMALL = PPOConfig(num_envs=4, rollout_length=64, epochs=2, minibatch_size=64, hidden_sizes=(16,))
+
+
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+    """Kill, resume, compare; exit code 1 if a resumed run differs."""
+
+    kills: int = 50
+    """Runs to kill."""
+    env: str = "nav2d"
+    """Task of the runs."""
+    seeds: int = 2
+    """Seeds of each run."""
+    seed: int = 0
+    """Of the moments."""
+    iterations: int = 60
+    """Iterations of collect, and of train."""
+
+
+def config(arguments: Arguments) -> Config:
+    """Return the config of the runs: every stage small, a checkpoint at nearly every iteration."""
+    ticks = arguments.iterations * SMALL.num_envs * SMALL.rollout_length
+    return Config(
+        env=EnvConfig(name=arguments.env),
+        collect=CollectConfig(ticks=ticks, capacity=ticks // 2, ppo=SMALL),
+        options=OptionsConfig(hidden_size=16, mlp_sizes=(16,), steps=4000, batch_size=32),
+        train=TrainConfig(ticks=ticks, ppo=SMALL),
+        evaluate=EvaluateConfig(episodes=2, video_ticks=0),
+        seeds=arguments.seeds,
+    )
+
+
+def start(folder: Path, *args: str) -> subprocess.Popen:
+    """Start a run in a process of its own, that keeps its compiled programs beside the run's folder."""
+    cache = {"JAX_COMPILATION_CACHE_DIR": str(folder.parent / "compiled")}
+    cache |= {"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
+    command = [sys.executable, "-W", "ignore", "-m", "taic_jax.run", *args, "--run-dir", str(folder)]
+    command += ["--checkpoint-seconds", "0"]
+    return subprocess.Popen(command, env=os.environ | cache, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+
+
+def finish(process: subprocess.Popen) -> None:
+    """Wait for a run's end.
+
+    Raises:
+      RuntimeError: it failed.
+    """
+    _, err = process.communicate()
+    if process.returncode:
+        raise RuntimeError(err.decode())
+
+
+def outcome(folder: Path) -> dict[str, Any]:
+    """Return all that a run leaves and that must not depend on interruptions, by name."""
+    summary = json.loads((folder / "summary.json").read_text())
+    rows = [{k: v for k, v in row.items() if k != "time"} for row in read_metrics(folder / "metrics.jsonl")]
+    order = {stage: i for i, stage in enumerate(dict.fromkeys(row["stage"] for row in rows))}
+    rows.sort(key=lambda row: order[row["stage"]])
+    result: dict[str, Any] = {"methods": summary["methods"], "ticks": summary["ticks"], "rows": rows}
+    return result | dict(_arrays(folder))
+
+
+def _arrays(folder: Path) -> Iterator[tuple[str, bytes]]:
+    from orbax.checkpoint import v1 as ocp
+
+    for path in sorted(folder.rglob("*.npz")):
+        with np.load(path) as blocks:
+            for name in blocks.files:
+                yield f"{path.relative_to(folder)}/{name}", blocks[name].tobytes()
+    for marker in sorted(folder.rglob("_CHECKPOINT_METADATA")):
+        tree = marker.parent
+        for name, array in ocp.load(str(tree.absolute())).items():
+            yield f"{tree.relative_to(folder)}/{name}", np.asarray(array).tobytes()
+
+
+def differences(a: dict[str, Any], b: dict[str, Any]) -> list[str]:
+    """Return the names under which two outcomes differ."""
+    return sorted(name for name in {**a, **b} if a.get(name) != b.get(name))
+
+
+def stage_of(folder: Path) -> str:
+    """Return the stage that a run was in when it was killed."""
+    path = folder / "metrics.jsonl"
+    rows = read_metrics(path) if path.exists() else []
+    return "end" if (folder / "summary.json").exists() else rows[-1]["stage"] if rows else "start"
+
+
+def kill_one(folder: Path, source: str, seconds: float) -> str:
+    """Kill a run after so many seconds, finish it, and return the stage it was killed in."""
+    process = start(folder, source)
+    time.sleep(seconds)
+    process.kill()
+    process.communicate()
+    stage = stage_of(folder)
+    begun = (folder / "config.yaml").exists()
+    finish(start(folder, "--resume") if begun else start(folder, source))
+    return stage
+
+
+def main() -> int:
+    """Run the experiment; return 1 if any resumed run differs."""
+    arguments = tyro.cli(Arguments)
+    moments, killed, bad = random.Random(arguments.seed), [], 0
+    with tempfile.TemporaryDirectory() as name:
+        root = Path(name)
+        source = root / "config.yaml"
+        source.write_text(to_yaml(config(arguments)))
+        finish(start(root / "warm", str(source)))  # fills the cache
+        begun = time.perf_counter()
+        finish(start(root / "whole", str(source)))
+        length = time.perf_counter() - begun
+        expected = outcome(root / "whole")
+        for i in range(arguments.kills):
+            seconds = moments.uniform(0.0, length)
+            killed.append(kill_one(root / "run", str(source), seconds))
+            found = differences(expected, outcome(root / "run"))
+            bad += bool(found)
+            print(f"{i + 1:3}  killed after {seconds:5.1f} s in {killed[-1]:8}", "differs:" if found else "identical",
+                  *found[:3], flush=True)  # fmt: skip
+            shutil.rmtree(root / "run")
+    counts = ", ".join(f"{killed.count(stage)} in {stage}" for stage in dict.fromkeys(killed))
+    print(f"{arguments.kills} runs killed ({counts}): {arguments.kills - bad} resumed runs identical, {bad} not")
+    return 1 if bad else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

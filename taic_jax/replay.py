@@ -1,0 +1,87 @@
+"""Show again how numbers stopped being finite: take the one step that failed from the state that was dumped."""
+
+import json
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from taic_jax.artifacts import DESCRIPTION, load_options
+from taic_jax.checkpoint import ArtifactError, load_tree
+from taic_jax.config_io import load_config
+from taic_jax.guard import FINITE, QUANTITIES
+from taic_jax.logging import RunLogger
+from taic_jax.options import learning
+from taic_jax.options.model import make_networks
+from taic_jax.pipeline import make_envs, make_level, select_windows, steps_per_log
+from taic_jax.stage import Clock, Run
+from taic_jax.types import as_arrays
+
+FIELDS = ("stage", "seed", "seeds", "step", "after", "quantity")
+
+
+def replay(dump: Path) -> str | None:
+    """Take the step after which a seed had stopped again, and say what was not finite; None if all was finite now.
+
+    Args:
+      dump: a folder under `dumps` of a run, which must still be where it was.
+
+    Raises:
+      ArtifactError: it is none, or not of this version's kind.
+    """
+    told = _read(dump)
+    run_dir = dump.absolute().parents[1]
+    config = load_config(run_dir / "config.yaml")
+    env, source = make_envs(config)
+    keys = jnp.stack([jax.random.key(config.seed + k) for k in range(told["seeds"])])
+    with RunLogger(run_dir, quiet=True) as logger:
+        run = Run(as_arrays(config), keys, run_dir, logger, Clock())
+        step, like, args = _stage(run, env, source, told["stage"])
+        state = load_tree(dump, jax.eval_shape(lambda state: jax.tree.map(lambda x: x[0], state), like))
+        # As many seeds as there were, all in this state: the program is the one that failed.
+        states = jax.tree.map(lambda x: jnp.broadcast_to(x, (told["seeds"], *x.shape)), state)
+        _, metrics, extra = run.compile(step, states, *args)(states, *args)
+    seed, code = told["seed"], int(metrics["nonfinite"][told["seed"]])
+    if code == FINITE:
+        return None
+    return (
+        f"seed {seed}, {told['stage']}, after {told['after']:,}: {QUANTITIES[code]} is not finite{_where(extra, seed)}"
+    )
+
+
+def _stage(run: Run, env: Any, source: Any, stage: str) -> tuple[Any, Any, tuple]:
+    """Return a stage's step over all seeds, the shapes of its state, and its other arguments."""
+    config, keys = run.config, run.stage_keys(stage)
+    if stage == "learn":
+        dataset = select_windows(run, source)
+        networks = make_networks(config.options, source.proprioceptive_size, source.action_size)
+        init = jax.vmap(partial(learning.init, config.options, networks))
+        steps = jax.vmap(partial(learning.steps, config.options, networks, steps_per_log(config.options)))
+        return steps, jax.eval_shape(init, keys), (dataset,)
+    level = make_level(config, source if stage == "collect" else env, stage)
+    folder = Path(config.options.source or run.dir)
+    model = (load_options(folder, env, config.options, len(keys)),) if stage == "train" else ()
+    return jax.vmap(level.step), jax.eval_shape(jax.vmap(level.init), keys, *model), model
+
+
+def _read(dump: Path) -> dict[str, Any]:
+    try:
+        told = json.loads((dump / DESCRIPTION).read_text())
+    except (OSError, ValueError):
+        told = None
+    if not isinstance(told, dict) or not set(FIELDS) <= set(told):
+        raise ArtifactError(f"{dump}: expected a folder under dumps of a run, where a seed stopped; got none")
+    return told
+
+
+def _where(experience: Any, seed: int) -> str:
+    """Return the first tick and environment whose numbers are not finite, if experience was recorded."""
+    for array in jax.tree.leaves(experience):
+        values = np.asarray(array[seed], np.float32)
+        bad = np.argwhere(~np.isfinite(values))
+        if len(bad):
+            return f", first at tick {bad[0][0]} of environment {bad[0][1]}"
+    return ""
