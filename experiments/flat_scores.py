@@ -22,7 +22,7 @@ from taic_jax.run_folder import prepare_folder
 from taic_jax.stage import CLOCK, Clock, Run
 from taic_jax.statistics import bootstrap_interval, iqm
 from taic_jax.summary import commit
-from taic_jax.types import as_arrays
+from taic_jax.types import as_rows
 
 # Mean return at one million interactions: CleanRL's benchmark (version 4; the ant's is the PPO of the TD3 paper,
 # version 1), and Tianshou's (version 3, the best evaluation of each run).
@@ -83,7 +83,7 @@ def score(arguments: Arguments, task: str) -> dict[str, str]:
     prepare_folder(config, folder, resume=(folder / "config.yaml").is_file())
     keys = jnp.stack([jax.random.key(config.seed + k) for k in range(config.seeds)])
     with RunLogger(folder) as logger:
-        run = Run(as_arrays(config), keys, folder, logger, Clock.load(folder / CLOCK))
+        run = Run(as_rows([config], config.seeds), keys, folder, logger, Clock.load(folder / CLOCK))
         last = train_baseline(run, make_envs(config)[0], "flat").last
     returns = np.asarray(last["return"]["return"], float)
     low, high = bootstrap_interval(returns)

@@ -26,7 +26,6 @@ from taic_jax.config import CollectConfig, Config, EnvConfig, EvaluateConfig, Op
 from taic_jax.config_io import to_yaml
 from taic_jax.logging import read_metrics
 
-STAGES = ("start", "collect", "learn", "train", "end")
 SMALL = PPOConfig(num_envs=4, rollout_length=64, epochs=2, minibatch_size=64, hidden_sizes=(16,))
 
 
@@ -83,8 +82,7 @@ def outcome(folder: Path) -> dict[str, Any]:
     """Return all that a run leaves and that must not depend on interruptions, by name."""
     summary = json.loads((folder / "summary.json").read_text())
     rows = [{k: v for k, v in row.items() if k != "time"} for row in read_metrics(folder / "metrics.jsonl")]
-    order = {stage: i for i, stage in enumerate(dict.fromkeys(row["stage"] for row in rows))}
-    rows.sort(key=lambda row: order[row["stage"]])
+    rows.sort(key=lambda row: row["stage"])  # an evaluation is told again after a resume, later than it was
     result: dict[str, Any] = {"methods": summary["methods"], "ticks": summary["ticks"], "rows": rows}
     return result | dict(_arrays(folder))
 

@@ -28,7 +28,7 @@ from taic_jax.run_folder import prepare_folder
 from taic_jax.stage import CLOCK, Clock, Run
 from taic_jax.statistics import bootstrap_interval, iqm, probability_of_improvement
 from taic_jax.summary import commit
-from taic_jax.types import as_arrays
+from taic_jax.types import as_rows
 
 RULES, DECODERS = ("fixed", "output", "predict"), ("open", "closed")
 FLAT = ("strong", "weak")
@@ -110,7 +110,7 @@ def run_flat(arguments: Arguments, task: str, strength: str) -> dict[str, Any]:
     prepare_folder(config, folder, resume=(folder / "config.yaml").is_file())
     keys = jnp.stack([jax.random.key(config.seed + k) for k in range(config.seeds)])
     with RunLogger(folder) as logger:
-        run = Run(as_arrays(config), keys, folder, logger, Clock.load(folder / CLOCK))
+        run = Run(as_rows([config], config.seeds), keys, folder, logger, Clock.load(folder / CLOCK))
         trained = collect(run, make_envs(config)[1])
     lists = {
         "first": trained.first["return"]["return"],

@@ -3,7 +3,7 @@
 import dataclasses
 import json
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -27,21 +27,34 @@ from taic_jax.normalize import Statistics
 from taic_jax.options import learning
 from taic_jax.options.dataset import Dataset, Experience, holds_out, make_dataset
 from taic_jax.options.execution import IdentityExecutor, make_executor
-from taic_jax.options.model import OptionModel, make_networks
+from taic_jax.options.model import Networks, OptionModel, make_networks
 from taic_jax.run_folder import claimed, prepare_folder
 from taic_jax.stage import CLOCK, Clock, Run, drive
 from taic_jax.summary import as_summary, write_video
-from taic_jax.types import as_arrays
+from taic_jax.types import as_rows
 
 STEPS_PER_LOG = 100
 
 
 def run_pipeline(
-    config: Config, run_dir: Path, *, resume: bool = False, overwrite: bool = False, **settings: Any
+    config: Config,
+    run_dir: Path,
+    *,
+    points: Sequence[Config] = (),
+    resume: bool = False,
+    overwrite: bool = False,
+    **settings: Any,
 ) -> dict:
     """Run every stage that is not done yet and return the summary, also written to `summary.json`.
 
-    `settings` may hold the `signals` and `checkpoint_seconds` of `stage.Run`.
+    Args:
+      config: what to run, for `config.seeds` seeds.
+      run_dir: its folder.
+      points: variants [G] of `config` that differ from it in floats alone, to be run in its place, in one program;
+        what is per seed is then of G K rows, one point after another.
+      resume: go on with the run in the folder.
+      overwrite: replace it.
+      **settings: the `signals` and `checkpoint_seconds` of `stage.Run`.
 
     Raises:
       Interrupted: a signal was received; resume goes on from where it came.
@@ -52,10 +65,12 @@ def run_pipeline(
     env, source = make_envs(config)
     model, policy = take_over(config, env, source)  # what is refused is refused before anything is written
     prepare_folder(config, run_dir, resume=resume, overwrite=overwrite)
+    points = points or (config,)
     # Seed k of a run is seed 0 of a run whose seed is k more.
-    keys = jnp.stack([jax.random.key(config.seed + k) for k in range(config.seeds)])
+    keys = jnp.stack([jax.random.key(config.seed + k) for _ in points for k in range(config.seeds)])
+    model, policy = _for_points((model, policy), len(points))
     with claimed(run_dir), RunLogger(run_dir) as logger:
-        run = Run(as_arrays(config), keys, run_dir, logger, Clock.load(run_dir / CLOCK), **settings)
+        run = Run(as_rows(points, config.seeds), keys, run_dir, logger, Clock.load(run_dir / CLOCK), **settings)
         logger.truncate("evaluate", -1)
         collector = collect(run, source) if needs_collect(config) else None
         model = learn(run, source) if model is None else model
@@ -122,6 +137,11 @@ def take_over(
     return model, policy
 
 
+def _for_points(tree: Any, count: int) -> Any:
+    """Repeat what is per seed for every point."""
+    return tree if count == 1 else jax.tree.map(lambda x: jnp.concatenate([x] * count), tree)
+
+
 def _train(
     run: Run,
     env: Env,
@@ -134,23 +154,33 @@ def _train(
 
     Where it begins from another's policy, that explores afresh: the standard deviation is the config's.
     """
-    level = make_level(run.config, env, stage)
-    state = jax.jit(jax.vmap(level.init))(run.stage_keys(stage), *model)
+    config, level = run.config, make_level(run.config, env, stage)
+    init, step, assess, agent = (over_rows(env, stage, name) for name in ("init", "step", "assess", "agent"))
+    state = jax.jit(init)(config, run.stage_keys(stage), *model)
     if begin:
         params = begin[0].replace(log_std=state.params.log_std)
         state = state.replace(params=params, obs_statistics=begin[1])
-    keys = run.stage_keys("evaluate")
-    assess = run.compile(jax.vmap(level.assess), keys, state, *model)
-    first = jax.device_get(assess(keys, state, *model))
+    given = config, run.stage_keys("evaluate")
+    assess = run.compile(assess, *given, state, *model)
+    first = jax.device_get(assess(*given, state, *model))
     state = drive(
-        run, stage, jax.vmap(level.step), state, *model,
-        num_steps=level.num_steps, unit=level.unit, ticks=level.unit * len(keys), after=after,
+        run, stage, lambda state, config, *model: step(config, state, *model), state, config, *model,
+        num_steps=level.num_steps, unit=level.unit, ticks=level.unit * len(run.keys), after=after,
     )  # fmt: skip
-    last = jax.device_get(assess(keys, state, *model))
+    last = jax.device_get(assess(*given, state, *model))
     stopped = run.stopped[stage].code != FINITE
     last = jax.tree.map(lambda x: np.where(stopped.reshape((-1,) + (1,) * (x.ndim - 1)), np.nan, x), last)
     run.logger.log("evaluate", level.ticks, {f"{stage}/{name}": x["return"] for name, x in last.items()})
-    return Trained(jax.vmap(level.agent)(state, *model), first, last)
+    return Trained(agent(config, state, *model), first, last)
+
+
+def over_rows(env: Env, stage: str, method: str) -> Callable[..., Any]:
+    """Return a method of a stage's level as a function of rows: (configs, *its arguments)."""
+    return jax.vmap(partial(_call, env, stage, method))
+
+
+def _call(env: Env, stage: str, method: str, config: Config, *args: Any) -> Any:
+    return getattr(make_level(config, env, stage), method)(*args)
 
 
 def make_level(config: Config, env: Env, stage: str) -> Level:
@@ -179,14 +209,21 @@ def learn(run: Run, env: Env) -> OptionModel:
     """Learn one option model per seed from the experience and save it as the artifact `options`."""
     config, dataset = run.config.options, select_windows(run, env)
     networks = make_networks(config, env.proprioceptive_size, env.action_size)
-    state = jax.jit(jax.vmap(partial(learning.init, config, networks)))(run.stage_keys("learn"))
+    init, steps = learn_over_rows(config, networks)
+    state = jax.jit(init)(config, run.stage_keys("learn"))
     if config.steps:  # with none, D stays as random as it was drawn
         unit = steps_per_log(config)
-        steps = jax.vmap(partial(learning.steps, config, networks, unit))
-        state = drive(run, "learn", steps, state, dataset, num_steps=config.steps // unit, unit=unit)
+        state = drive(run, "learn", steps, state, config, dataset, num_steps=config.steps // unit, unit=unit)
     model = learning.as_model(state, dataset)
     save_options(run.dir / OPTIONS, model, env, config)
     return model
+
+
+def learn_over_rows(config: OptionsConfig, networks: Networks) -> tuple[Callable[..., Any], Callable[..., Any]]:
+    """Return stage learn's (configs, keys) -> states and (states, configs, datasets) -> (states, metrics, None)."""
+    unit = steps_per_log(config) if config.steps else 0
+    init = jax.vmap(lambda config, key: learning.init(config, networks, key))
+    return init, jax.vmap(lambda state, config, dataset: learning.steps(config, networks, unit, state, dataset))
 
 
 def steps_per_log(config: OptionsConfig) -> int:
@@ -201,11 +238,16 @@ def select_windows(run: Run, env: Env) -> Dataset:
       ArtifactError: there is no experience, or it is of another body.
       ConfigError: it holds no window of the kind that the config asks for.
     """
-    config, seeds = run.config.options, len(run.keys)
+    config, rows, seeds = run.config.options, len(run.keys), run.config.seeds
     names = config.experience or (COLLECT,)
-    sources = [gather_experience(run.dir if name == COLLECT else Path(name), env, seeds) for name in names]
-    dataset = jax.jit(jax.vmap(partial(make_dataset, config=config)))(sources)
-    span = f"in {', '.join(names)} between its shares {float(config.since):g} and {float(config.until):g}"
+    sources = [
+        gather_experience(run.dir, env, rows)
+        if name == COLLECT
+        else _for_points(gather_experience(Path(name), env, seeds), rows // seeds)
+        for name in names
+    ]
+    dataset = jax.jit(jax.vmap(make_dataset))(sources, config)
+    span = f"in {', '.join(names)} between its shares {jnp.min(config.since):g} and {jnp.max(config.until):g}"
     if not dataset.count.all():
         raise ConfigError(
             "options.length: expected the experience to hold windows of so many ticks, "

@@ -1,7 +1,6 @@
 """Show again how numbers stopped being finite: take the one step that failed from the state that was dumped."""
 
 import json
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +11,13 @@ import numpy as np
 from taic_jax.artifacts import DESCRIPTION, load_options
 from taic_jax.checkpoint import ArtifactError, load_tree
 from taic_jax.config_io import load_config
+from taic_jax.envs.base import Env
 from taic_jax.guard import FINITE, QUANTITIES
 from taic_jax.logging import RunLogger
-from taic_jax.options import learning
 from taic_jax.options.model import make_networks
-from taic_jax.pipeline import make_envs, make_level, select_windows, steps_per_log
+from taic_jax.pipeline import learn_over_rows, make_envs, over_rows, select_windows
 from taic_jax.stage import Clock, Run
-from taic_jax.types import as_arrays
+from taic_jax.types import as_rows
 
 FIELDS = ("stage", "seed", "seeds", "step", "after", "quantity")
 
@@ -38,12 +37,14 @@ def replay(dump: Path) -> str | None:
     env, source = make_envs(config)
     keys = jnp.stack([jax.random.key(config.seed + k) for k in range(told["seeds"])])
     with RunLogger(run_dir, quiet=True) as logger:
-        run = Run(as_arrays(config), keys, run_dir, logger, Clock())
+        run = Run(as_rows([config], told["seeds"]), keys, run_dir, logger, Clock())
         step, like, args = _stage(run, env, source, told["stage"])
-        state = load_tree(dump, jax.eval_shape(lambda state: jax.tree.map(lambda x: x[0], state), like))
+        like = jax.eval_shape(lambda rows: jax.tree.map(lambda x: x[0], rows), {"state": like, "config": run.config})
         # As many seeds as there were, all in this state: the program is the one that failed.
-        states = jax.tree.map(lambda x: jnp.broadcast_to(x, (told["seeds"], *x.shape)), state)
-        _, metrics, extra = run.compile(step, states, *args)(states, *args)
+        seeds = told["seeds"]
+        rows = jax.tree.map(lambda x: jnp.broadcast_to(x, (seeds, *x.shape)), load_tree(dump, like))
+        given = (rows["state"], rows["config"].options if told["stage"] == "learn" else rows["config"], *args)
+        _, metrics, extra = run.compile(step, *given)(*given)
     seed, code = told["seed"], int(metrics["nonfinite"][told["seed"]])
     if code == FINITE:
         return None
@@ -52,19 +53,18 @@ def replay(dump: Path) -> str | None:
     )
 
 
-def _stage(run: Run, env: Any, source: Any, stage: str) -> tuple[Any, Any, tuple]:
-    """Return a stage's step over all seeds, the shapes of its state, and its other arguments."""
+def _stage(run: Run, env: Env, source: Env, stage: str) -> tuple[Any, Any, tuple]:
+    """Return a stage's step (states, configs, ...), the shapes of its states, and its other arguments."""
     config, keys = run.config, run.stage_keys(stage)
     if stage == "learn":
-        dataset = select_windows(run, source)
         networks = make_networks(config.options, source.proprioceptive_size, source.action_size)
-        init = jax.vmap(partial(learning.init, config.options, networks))
-        steps = jax.vmap(partial(learning.steps, config.options, networks, steps_per_log(config.options)))
-        return steps, jax.eval_shape(init, keys), (dataset,)
-    level = make_level(config, source if stage == "collect" else env, stage)
+        init, steps = learn_over_rows(config.options, networks)
+        return steps, jax.eval_shape(init, config.options, keys), (select_windows(run, source),)
+    task = source if stage == "collect" else env
     folder = Path(config.options.source or run.dir)
     model = (load_options(folder, env, config.options, len(keys)),) if stage == "train" else ()
-    return jax.vmap(level.step), jax.eval_shape(jax.vmap(level.init), keys, *model), model
+    init, step = over_rows(task, stage, "init"), over_rows(task, stage, "step")
+    return lambda state, config, *model: step(config, state, *model), jax.eval_shape(init, config, keys, *model), model
 
 
 def _read(dump: Path) -> dict[str, Any]:

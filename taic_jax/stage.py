@@ -59,7 +59,7 @@ class Stopped(NamedTuple):
 
 @dataclass(frozen=True)
 class Run:
-    """What every stage needs: the config with array leaves, one key per seed, where to write, when to stop."""
+    """What every stage needs: rows of configs and keys, one per seed (of each point), where to write, when to stop."""
 
     config: Config
     keys: jax.Array
@@ -92,7 +92,7 @@ class Run:
             folder = self.dir / DUMPS / f"{stage}-{steps[seed] * unit}-seed{seed}"
             told = {"stage": stage, "seed": int(seed), "seeds": len(codes), "step": int(steps[seed])}
             told |= {"after": int(steps[seed] * unit), "quantity": QUANTITIES[codes[seed]]}
-            save_tree(folder, jax.tree.map(lambda x, k=seed: x[k], guard.state))
+            save_tree(folder, jax.tree.map(lambda x, k=seed: x[k], {"state": guard.state, "config": self.config}))
             save_text(folder / "description.json", json.dumps(told, indent=2) + "\n")
             print(
                 f"taic_jax: seed {seed} stopped in {stage} after {told['after']:,}: its {told['quantity']} is not "

@@ -6,6 +6,7 @@ Axes, used in every docstring of the package:
 """
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any, TypeVar
 
 import jax
@@ -37,6 +38,12 @@ def as_arrays(tree: Tree) -> Tree:
     Python floats would be weakly typed leaves, and a second call with arrays would compile again.
     """
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), tree)
+
+
+def as_rows(configs: Sequence[Tree], seeds: int) -> Tree:
+    """Stack configs that differ in their floats alone, each `seeds` times: rows [G K], one point after another."""
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(as_arrays(config) for config in configs))
+    return jax.tree.map(lambda x: jnp.repeat(x, seeds, axis=0), stacked)
 
 
 def select(condition: Bool[Array, " B"], if_true: Tree, if_false: Tree) -> Tree:

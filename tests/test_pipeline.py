@@ -22,7 +22,7 @@ from taic_jax.logging import RunLogger
 from taic_jax.options.dataset import Experience
 from taic_jax.pipeline import run_pipeline
 from taic_jax.run_folder import RunFolderError
-from taic_jax.types import as_arrays
+from taic_jax.types import as_rows
 
 STAGES = {"collect": 3, "learn": 2, "train": 3}
 
@@ -173,6 +173,6 @@ def test_experience_without_the_windows_that_are_needed_is_refused(tmp_path, mon
     experience = Experience(obs, action, reward=obs[..., 0], done=jnp.zeros((1, 160, 1), bool))
     monkeypatch.setattr(pipeline, "gather_experience", lambda *_: experience)
     options = dataclasses.replace(CONFIG.options, termination="predict", since=since, until=until)
-    config = as_arrays(dataclasses.replace(CONFIG, options=options))
+    config = as_rows([dataclasses.replace(CONFIG, options=options, seeds=1)], 1)
     with RunLogger(tmp_path) as logger, pytest.raises(ConfigError, match=message):
         pipeline.learn(stage.Run(config, jax.random.split(jax.random.key(0), 1), tmp_path, logger, stage.Clock()), env)
