@@ -82,6 +82,19 @@ def mistyped(name: str, kind: Any, value: Any) -> ConfigError:
     return ConfigError(f"{name}: expected {expected}, got {_show(value)}{hint}")
 
 
+def from_text(name: str, kind: Any, text: str) -> Any:
+    """Read one value of a field from what was typed for it, as strictly as from YAML.
+
+    Raises:
+        ConfigError: it is not of the field's type.
+    """
+    try:
+        value = text if kind is str or get_origin(kind) is Literal else yaml.load(text, Loader=_Loader)
+    except yaml.YAMLError:
+        value = text
+    return _coerce(name, kind, value)
+
+
 def closest(name: str, names: Iterable[str]) -> str:
     """Return the one of the dotted `names` that looks most like `name`, if possible one that ends like it."""
     names, end = list(names), name.rpartition(".")[2].lstrip("-")

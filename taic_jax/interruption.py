@@ -1,4 +1,4 @@
-"""Signals that ask a run to stop: it finishes its iteration, saves, and can go on later."""
+"""Why a run ends before its end: signals ask it to, after its iteration and saved, or no seed is left."""
 
 import signal
 import sys
@@ -12,6 +12,10 @@ class Interrupted(BaseException):  # like KeyboardInterrupt, which no `except Ex
     def __init__(self, received: int):
         super().__init__(signal.Signals(received).name)
         self.received = received
+
+
+class DivergedError(ArithmeticError):
+    """No seed is left whose numbers are finite."""
 
 
 class Signals:

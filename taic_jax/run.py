@@ -1,102 +1,40 @@
-"""The command line: `python -m taic_jax.run [CONFIG] [--run-dir DIR] [--section.field value ...]`.
+"""The command line: `python -m taic_jax.run [CONFIG] [--run-dir DIR] [--section.field value ...]`."""
 
-The command is parsed and checked before JAX is imported, so that help and mistakes answer at once.
-"""
-
-import contextlib
-import dataclasses
-import io
-import itertools
-import os
-import signal
 import sys
-import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, get_type_hints
+from typing import Annotated
 
 import tyro
 
-from taic_jax.config import Config, ConfigError, walk
-from taic_jax.config_io import closest, load_config, mistyped, preset_names, to_yaml
-from taic_jax.interruption import Interrupted, Signals
-from taic_jax.validation import validate
+from taic_jax import command_line
+from taic_jax.command_line import FAILED, answer, attempt
+from taic_jax.config_io import to_yaml
 
-DEFAULT_PRESET = "nav2d"
 PROGRAM = "python -m taic_jax.run"
-FAILED = 1
-EXIT_CODES: dict[int, int] = {signal.SIGINT: 130, signal.SIGTERM: 75}
 
 
 @dataclass(frozen=True)
-class Command:
+class Command(command_line.Command):
     """Collect experience, learn options from it, train a policy that chooses among them, and evaluate."""
 
-    source: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="CONFIG")] = DEFAULT_PRESET
-    """Name of a preset, or path of a YAML file; with --resume by default the run's own."""
-    run_dir: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
-    """Folder of the run; by default runs/CONFIG-DATE-TIME."""
-    resume: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Continue the run in --run-dir from its last checkpoint."""
-    overwrite: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Replace the run in --run-dir."""
-    dry_run: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Print the configuration and the plan, and stop."""
-    checkpoint_seconds: float = 30.0
-    """Least seconds between two checkpoints of a stage; 0 makes one every iteration."""
     replay: Annotated[Path | None, tyro.conf.arg(metavar="DUMP")] = None
     """Take the step again at which a seed stopped, from the state that the run left under dumps, and stop."""
-    options: Annotated[str, tyro.conf.arg(metavar="RUN")] = ""
-    """Run or artifact whose option model is used as it is; short for --options.source."""
-    config: Annotated[Config, tyro.conf.arg(name=""), tyro.conf.FlagConversionOff] = Config()
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Run one command and return its exit code.
-
-    It is 0, or 2 for a mistake of the user; a run that was told to stop and saved what it had done gives 130 after
-    SIGINT (Ctrl-C) and 75, the system's "try again", after SIGTERM; one whose every seed diverged gives 1.
-    """
-    try:
-        return execute(parse(sys.argv[1:] if args is None else args))
-    except KeyboardInterrupt:
-        print("taic_jax: interrupted", file=sys.stderr)
-        return 130
-    except BrokenPipeError:  # the reader, such as head, has seen enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    except (ValueError, OSError) as error:
-        if not _is_mistake(error):
-            raise
-        print("taic_jax: error:", " ".join(str(error).split()), file=sys.stderr)
-        return 2
-    return 0
+    """Run one command and return its exit code; see docs/trouble.md."""
+    return answer(args, PROGRAM, Command, execute)
 
 
 def parse(args: Sequence[str]) -> Command:
-    """Parse and check the arguments; the fields start from the preset or file that they name.
+    """Parse and check the arguments.
 
     Raises:
-        ConfigError: an argument, the named preset or file, or a value is not valid.
+      ConfigError: an argument, the named preset or file, or a value is not valid.
     """
-    first = args[0] if args and not args[0].startswith("-") else DEFAULT_PRESET
-    command = _parse_over(args, first)
-    if command.resume and command.overwrite:
-        raise ConfigError("--resume and --overwrite: expected at most one of the two")
-    if command.resume and command.run_dir is None:
-        raise ConfigError("--resume: expected the folder of the run to continue, as in --run-dir DIR")
-    if command.run_dir and command.resume and command.source not in args:
-        own = command.run_dir / "config.yaml"
-        command = _parse_over(args, str(own)) if own.is_file() else command
-    elif command.source != first:
-        command = _parse_over(args, command.source)
-    if not command.checkpoint_seconds >= 0:
-        raise ConfigError(f"--checkpoint-seconds: expected at least 0, got {command.checkpoint_seconds}")
-    if command.options:
-        options = dataclasses.replace(command.config.options, source=command.options)
-        command = dataclasses.replace(command, config=dataclasses.replace(command.config, options=options))
-    validate(command.config)
-    return command
+    return command_line.parse(args, PROGRAM, Command)
 
 
 def execute(command: Command) -> int:
@@ -108,91 +46,23 @@ def execute(command: Command) -> int:
         print(found or f"{command.replay}: all numbers were finite this time")
         return 0 if found else FAILED
     from taic_jax.pipeline import make_envs, run_pipeline
-    from taic_jax.stage import DivergedError
     from taic_jax.summary import plan
 
     if command.dry_run:
         print(to_yaml(command.config))
         print(plan(command.config, *make_envs(command.config)))
         return 0
-    name = f"{Path(command.source).stem}-{time.strftime('%Y%m%d-%H%M%S')}"
-    run_dir = command.run_dir or Path("runs") / name
-    try:
-        with Signals() as signals:
-            run_pipeline(
-                command.config, run_dir, resume=command.resume, overwrite=command.overwrite,
-                signals=signals, checkpoint_seconds=command.checkpoint_seconds,
-            )  # fmt: skip
-    except (Interrupted, KeyboardInterrupt) as stop:
-        received = stop.received if isinstance(stop, Interrupted) else signal.SIGINT
-        name = signal.Signals(received).name
-        print(f"taic_jax: stopped by {name}; --resume --run-dir {run_dir} goes on", file=sys.stderr)
-        return EXIT_CODES[received]
-    except DivergedError as error:
-        print(f"taic_jax: error: {error}", file=sys.stderr)
-        return FAILED
-    print(run_dir / "summary.json")
-    return 0
-
-
-def _parse_over(args: Sequence[str], source: str) -> Command:
-    default = Command(source=source, config=load_config(source))
-    description = f"{Command.__doc__}\n\nPresets: {', '.join(preset_names())}."
-    if "-h" in args or "--help" in args:  # alone, or tyro leaves the arguments before it out of the help
-        args = ["--help"]
-    try:
-        with contextlib.redirect_stderr(io.StringIO()):
-            return tyro.cli(Command, prog=PROGRAM, description=description, args=args, default=default)
-    except SystemExit as stop:
-        if not stop.code:
-            raise
-    raise _explain(args)
-
-
-def _explain(args: Sequence[str]) -> ConfigError:
-    """Find the argument that tyro refused, by parsing each option alone, and tell it in one line."""
-    hints = {**get_type_hints(Command), **{name: _kind(name) for name, _ in walk(Config())}}
-    known = {f"--{name}": kind for name, kind in hints.items() if name not in ("source", "config")}
-    for option, values in _options(args):
-        name = "--" + option.lstrip("-").replace("-", "_")
-        if name not in known:
-            return ConfigError(f"unknown option {option}; the nearest is {closest(name, known)}")
-        try:
-            with contextlib.redirect_stderr(io.StringIO()):
-                tyro.cli(Command, args=[option, *values])
-        except SystemExit:
-            return mistyped(option, known[name], " ".join(values) or None)
-    return ConfigError(f"unexpected argument in {' '.join(args)!r}; expected one CONFIG and options, see --help")
-
-
-def _options(args: Sequence[str]) -> Iterator[tuple[str, list[str]]]:
-    """Yield each option with the values that follow it."""
-    starts = [i for i, arg in enumerate(args) if arg.startswith("-") and not _is_number(arg)]
-    for start, end in itertools.pairwise([*starts, len(args)]):
-        option, equals, value = args[start].partition("=")
-        yield option, [value] * bool(equals) + list(args[start + 1 : end])
-
-
-def _kind(name: str) -> Any:
-    """Return the type of the field with this dotted name."""
-    kind: Any = Config
-    for part in name.split("."):
-        kind = get_type_hints(kind)[part]
-    return kind
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
-
-
-def _is_mistake(error: ValueError | OSError) -> bool:
-    """Tell a mistake of the user (our own errors, files that cannot be used) from one of the program."""
-    ours = type(error).__module__.partition(".")[0] == "taic_jax"
-    return ours or (isinstance(error, OSError) and error.filename is not None)
+    run_dir = command.folder
+    code = attempt(
+        lambda signals: run_pipeline(
+            command.config, run_dir, resume=command.resume, overwrite=command.overwrite,
+            signals=signals, checkpoint_seconds=command.checkpoint_seconds,
+        ),
+        run_dir,
+    )  # fmt: skip
+    if not code:
+        print(run_dir / "summary.json")
+    return code
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ import numpy as np
 from taic_jax.checkpoint import Checkpoints, save_text, save_tree
 from taic_jax.config import Config
 from taic_jax.guard import FINITE, QUANTITIES, Guarded, begin, guarded
-from taic_jax.interruption import Signals
+from taic_jax.interruption import DivergedError, Signals
 from taic_jax.logging import RunLogger
 
 S = TypeVar("S")
@@ -44,10 +44,6 @@ class Clock:
     def load(cls, path: Path) -> "Clock":
         """Read what `save` wrote; without a file, start at zero."""
         return cls(**json.loads(path.read_text())) if path.exists() else cls()
-
-
-class DivergedError(ArithmeticError):
-    """No seed is left whose numbers are finite."""
 
 
 class Stopped(NamedTuple):

@@ -9,7 +9,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PACKAGE = sorted((ROOT / "taic_jax").glob("*.py")) + sorted(
     path
-    for folder in ("envs", "experiments", "taic_jax/options", "taic_jax/rl")
+    for folder in ("envs", "experiments", "taic_jax/options", "taic_jax/rl", "taic_jax/sweep")
     for path in (ROOT / folder).rglob("*.py")
 )
 ALL = PACKAGE + sorted((ROOT / "tests").rglob("*.py"))
@@ -25,8 +25,8 @@ LAYERS = (
     "logging interruption level",
     "stage summary",
     "pipeline",
-    "replay",
-    "run",
+    "replay command_line",
+    "run sweep",
     "experiments",
 )
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names.split()}

@@ -1,0 +1,142 @@
+"""Axes of a sweep: which fields take which values, the points they span, and which points fit into one program."""
+
+import dataclasses
+import itertools
+import math
+import random
+from collections.abc import Iterator, Sequence
+from typing import Any, get_type_hints
+
+from taic_jax.config import Config, ConfigError, walk
+from taic_jax.config_io import closest, from_text
+from taic_jax.validation import validate
+
+RANGE, LOGARITHMIC = "..", ":log"
+STATIC_FLOATS = ("env.",)
+"""Fields that a program is built from although they are numbers: environments are made outside of it."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Axis:
+    """A field and its values, or the interval that they are drawn from."""
+
+    name: str
+    values: tuple[Any, ...] = ()
+    low: float = 0.0
+    high: float = 0.0
+    logarithmic: bool = False
+
+    @property
+    def is_range(self) -> bool:
+        """Whether values are drawn from an interval."""
+        return not self.values
+
+    def draw(self, generator: random.Random) -> Any:
+        """Return a random value: one of the values, or uniform in the interval, or in its logarithm."""
+        if not self.is_range:
+            return generator.choice(self.values)
+        if self.logarithmic:
+            return math.exp(generator.uniform(math.log(self.low), math.log(self.high)))
+        return generator.uniform(self.low, self.high)
+
+
+def parse_axis(text: str) -> Axis:
+    """Read FIELD=V1,V2,... or FIELD=LOW..HIGH or FIELD=LOW..HIGH:log.
+
+    Raises:
+      ConfigError: there is no such field, a value is not of its type, or the interval is empty.
+    """
+    name, equals, values = text.partition("=")
+    kinds = dict(_kinds(Config))
+    name = name.strip().replace("-", "_")
+    if name not in kinds or not equals:
+        what = f"unknown field {name!r}" if equals else f"expected FIELD=VALUES, got {text!r}"
+        raise ConfigError(f"--axes: {what}; the nearest field is {closest(name, kinds)}")
+    if name in ("seed", "seeds"):
+        raise ConfigError(f"--axes: {name}: every point runs the same seeds; give them by --seed and --seeds")
+    if RANGE not in values:
+        parts = values.split(",") if values else []
+        if not parts:
+            raise ConfigError(f"--axes: {name}: expected values with commas between, got none")
+        return Axis(name, tuple(from_text(f"--axes: {name}", kinds[name], part.strip()) for part in parts))
+    if not is_leaf(name):
+        raise ConfigError(f"--axes: {name}: an interval is for numbers that one program can vary, got {values!r}")
+    interval, _, scale = values.partition(":")
+    low, high = (from_text(f"--axes: {name}", float, part.strip()) for part in interval.split(RANGE, 1))
+    if scale not in ("", "log") or not low < high or (scale and low <= 0):
+        expected = "LOW..HIGH, or LOW..HIGH:log with 0 < LOW < HIGH"
+        raise ConfigError(f"--axes: {name}: expected {expected}, got {values!r}")
+    return Axis(name, (), low, high, bool(scale))
+
+
+def is_leaf(name: str) -> bool:
+    """Return whether one program can run many values of this field."""
+    return type(dict(walk(Config()))[name]) is float and not name.startswith(STATIC_FLOATS)
+
+
+def replace(config: Any, name: str, value: Any) -> Any:
+    """Replace the field of this dotted name."""
+    first, _, rest = name.partition(".")
+    return dataclasses.replace(config, **{first: replace(getattr(config, first), rest, value) if rest else value})
+
+
+def grid(axes: Sequence[Axis]) -> list[dict[str, Any]]:
+    """Return every combination of the axes' values.
+
+    Raises:
+      ConfigError: an axis is an interval.
+    """
+    for axis in axes:
+        if axis.is_range:
+            raise ConfigError(f"--axes: {axis.name}: an interval needs --samples or --optuna; a grid takes values")
+    names = [axis.name for axis in axes]
+    return [dict(zip(names, values, strict=True)) for values in itertools.product(*(axis.values for axis in axes))]
+
+
+def sample(axes: Sequence[Axis], count: int, seed: int) -> list[dict[str, Any]]:
+    """Return random points."""
+    generator = random.Random(seed)
+    return [{axis.name: axis.draw(generator) for axis in axes} for _ in range(count)]
+
+
+def configs_of(config: Config, points: Sequence[dict[str, Any]]) -> list[Config]:
+    """Return the config of each point.
+
+    Raises:
+      ConfigError: one is impossible; the message names the point.
+    """
+    result = []
+    for point in points:
+        changed = config
+        for name, value in point.items():
+            changed = replace(changed, name, value)
+        try:
+            validate(changed)
+        except ConfigError as error:
+            raise ConfigError(f"--axes: point {show(point)}: {error}") from None
+        result.append(changed)
+    return result
+
+
+def chunks(points: Sequence[dict[str, Any]], size: int) -> list[list[int]]:
+    """Cut points, by their index, into chunks of at most `size` that differ in nothing that sets a program apart."""
+    groups: dict[str, list[int]] = {}
+    for i, point in enumerate(points):
+        static = {name: value for name, value in point.items() if not is_leaf(name)}
+        groups.setdefault(repr(sorted(static.items())), []).append(i)
+    return [group[i : i + size] for group in groups.values() for i in range(0, len(group), size)]
+
+
+def show(point: dict[str, Any]) -> str:
+    """Return a point in one line."""
+    return " ".join(
+        f"{name}={value:g}" if isinstance(value, float) else f"{name}={value}" for name, value in point.items()
+    )
+
+
+def _kinds(cls: type, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for name, kind in get_type_hints(cls).items():
+        if dataclasses.is_dataclass(kind):
+            yield from _kinds(kind, f"{prefix}{name}.")  # type: ignore[arg-type]
+        else:
+            yield prefix + name, kind

@@ -1,0 +1,83 @@
+"""How many points of a sweep fit into memory at once: measured on the programs for one row."""
+
+import os
+import resource
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from taic_jax.config import Config, ConfigError, needs_collect
+from taic_jax.experience import experience_bytes, num_blocks
+from taic_jax.options.dataset import Experience, make_dataset
+from taic_jax.pipeline import make_envs, over_rows
+from taic_jax.types import as_rows
+
+MIB = 2**20
+
+
+def points_that_fit(config: Config, memory: int) -> int:
+    """Return how many points, each with all its seeds, run in `memory` MiB; 0 stands for half of the machine's.
+
+    Raises:
+      ConfigError: not even one does.
+    """
+    limit = (memory or machine_memory() // 2) * MIB
+    used = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    _, source = make_envs(config)
+    least = 2 * experience_bytes(source, config.collect.capacity) * config.seeds if needs_collect(config) else 0
+    if used + least < limit:
+        count = int((limit - used) / (row_bytes(config) * config.seeds))
+        if count:
+            return count
+    raise ConfigError(
+        f"--memory: expected at least {(used + least) // MIB + 1:,} MiB for one point with {config.seeds} seeds, got "
+        f"{limit // MIB:,}; fewer seeds or a smaller collect.capacity take less"
+    )
+
+
+def row_bytes(config: Config) -> int:
+    """Return the bytes that the hungriest program takes for one row: its arguments, results and scratch."""
+    env, source = make_envs(config)
+    rows = as_rows([config], 1)
+    keys = jax.random.split(jax.random.key(0), 1)
+    sizes = [0]
+    if needs_collect(config):
+        sizes.append(_step_bytes(rows, source, "collect", keys))
+    sizes.append(_step_bytes(rows, env, config.train.baselines[0] if config.train.baselines else "collect", keys))
+    if not config.options.source:
+        sizes.append(_program_bytes(jax.vmap(make_dataset), _experience(config, source), rows.options))
+    return max(sizes)
+
+
+def machine_memory() -> int:
+    """Return the MiB that this process may use in all."""
+    total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    limit = Path("/sys/fs/cgroup/memory.max")
+    text = limit.read_text().strip() if limit.exists() else "max"
+    return min(total, int(text) if text.isdigit() else total) // MIB
+
+
+def _step_bytes(rows: Config, env: Any, stage: str, keys: jax.Array) -> int:
+    init, step = over_rows(env, stage, "init"), over_rows(env, stage, "step")
+    return _program_bytes(step, rows, jax.eval_shape(init, rows, keys))
+
+
+def _experience(config: Config, env: Any) -> list[Experience]:
+    """Return the shapes of what options are learnt from, one row of each source."""
+    ppo = config.collect.ppo
+    ticks = min(num_blocks(config.collect) * ppo.rollout_length, config.collect.ticks // ppo.num_envs)
+    shape = partial(jax.ShapeDtypeStruct, dtype=jnp.float32)
+    base = (1, ticks, ppo.num_envs)
+    one = Experience(
+        shape((*base, env.proprioceptive_size)), shape((*base, env.action_size)), shape(base),
+        jax.ShapeDtypeStruct(base, bool),
+    )  # fmt: skip
+    return [one] * max(len(config.options.experience), 1)
+
+
+def _program_bytes(function: Any, *args: Any) -> int:
+    sizes: Any = jax.jit(function).lower(*args).compile().memory_analysis()
+    return sizes.argument_size_in_bytes + sizes.output_size_in_bytes + sizes.temp_size_in_bytes

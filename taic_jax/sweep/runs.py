@@ -1,0 +1,177 @@
+"""The runs of a sweep: chunk by chunk, each a resumable run; then one table, the best point, and its neighbours."""
+
+import csv
+import dataclasses
+import io
+import json
+import shutil
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from taic_jax.checkpoint import save_text
+from taic_jax.config import Config
+from taic_jax.config_io import to_yaml
+from taic_jax.experience import EXPERIENCE
+from taic_jax.interruption import DivergedError
+from taic_jax.pipeline import run_pipeline
+from taic_jax.run_folder import RunFolderError, claimed, prepare_folder
+from taic_jax.statistics import bootstrap_interval, iqm
+from taic_jax.sweep.axes import Axis, chunks, configs_of, replace, show
+from taic_jax.sweep.marginals import draw_marginals
+
+PLAN, TABLE, BEST, MARGINALS = "plan.json", "table.csv", "best.yaml", "marginals.png"
+
+
+@dataclasses.dataclass
+class Plan:
+    """What is asked for, the points [G], and the chunks of their indices that run in one program each.
+
+    Points that Optuna asks for are added as it asks; `trials` are its numbers of them.
+    """
+
+    axes: list[str]
+    samples: int
+    optuna: int
+    size: int
+    points: list[dict[str, Any]]
+    chunks: list[list[int]]
+    trials: list[int] = dataclasses.field(default_factory=list)
+
+    def tell(self, config: Config) -> str:
+        """Return the plan in a few lines."""
+        count = self.optuna or len(self.points)
+        programs = "as Optuna asks" if self.optuna else f"in {len(self.chunks)} programs"
+        lines = [f"{count} points x {config.seeds} seeds, at most {self.size} points at once, {programs}"]
+        return "\n".join(lines + [f"  {i:3} {show(point)}" for i, point in enumerate(self.points)])
+
+    def save(self, run_dir: Path) -> None:
+        """Write the plan to a run's folder."""
+        save_text(run_dir / PLAN, json.dumps(dataclasses.asdict(self), indent=1) + "\n")
+
+
+def run_sweep(
+    config: Config,
+    axes: list[Axis],
+    plan: Plan,
+    run_dir: Path,
+    *,
+    resume: bool = False,
+    overwrite: bool = False,
+    **settings: Any,
+) -> None:
+    """Run what is missing, and write the table after every chunk, the best point and the marginal plots at the end.
+
+    Raises:
+      Interrupted: a signal was received; resume goes on from where it came.
+      RunFolderError: the folder holds another sweep, or none to resume, or another process is at it.
+    """
+    config = replace(config, "evaluate.video_ticks", 0)
+    prepare_folder(config, run_dir, resume=resume, overwrite=overwrite)
+    with claimed(run_dir):
+        plan = _resumed(plan, run_dir) if resume else plan
+        plan.save(run_dir)
+        if resume and (run_dir / BEST).is_file():
+            print(f"taic_jax: {run_dir} is finished: see {run_dir / TABLE}", file=sys.stderr)
+            return
+        table: list[dict[str, Any]] = []
+        for chunk in _chunks(config, axes, plan, run_dir, table):
+            table += run_chunk(config, plan, chunk, run_dir, settings)
+            _write_table(run_dir / TABLE, table)
+        finished = [row for row in table if np.isfinite(row["iqm"])]
+        if finished:
+            best = max(finished, key=lambda row: row["iqm"])
+            save_text(run_dir / BEST, to_yaml(configs_of(config, [plan.points[best["point"]]])[0]))
+            interval = f"{best['low']:.4g} … {best['high']:.4g}"
+            print(f"best: {show(plan.points[best['point']])}: {best['iqm']:.4g} ({interval})")
+        draw_marginals(run_dir / MARGINALS, axes, plan.points, {row["point"]: row["iqm"] for row in table})
+
+
+def run_chunk(config: Config, plan: Plan, chunk: int, run_dir: Path, settings: dict[str, Any]) -> list[dict[str, Any]]:
+    """Run one chunk, unless it is done, and return a row per point."""
+    folder, which = run_dir / f"chunk-{chunk:03d}", plan.chunks[chunk]
+    points = configs_of(config, [plan.points[i] for i in which])
+    if not (folder / "summary.json").is_file():
+        begun = (folder / "config.yaml").is_file()
+        try:
+            run_pipeline(points[0], folder, points=points, resume=begun, **settings)
+        except DivergedError as error:
+            print(f"taic_jax: {error}", file=sys.stderr)
+            save_text(folder / "summary.json", json.dumps({"methods": {}}) + "\n")
+        for name in (EXPERIENCE, "checkpoints"):  # what is only needed to go on
+            shutil.rmtree(folder / name, ignore_errors=True)
+    told = json.loads((folder / "summary.json").read_text())["methods"].get("taic", {}).get("return", {})
+    nothing = [None] * (len(which) * config.seeds)
+    last, first = (np.array(told.get(name, nothing), float) for name in ("per_seed", "first_per_seed"))
+    return [
+        _row(plan, i, config, returns, begun)
+        for i, returns, begun in zip(which, last.reshape(len(which), -1), first.reshape(len(which), -1), strict=True)
+    ]
+
+
+def _row(plan: Plan, i: int, config: Config, returns: np.ndarray, first: np.ndarray) -> dict[str, Any]:
+    low, high = bootstrap_interval(returns)
+    return {
+        "point": i, **plan.points[i], "seeds": config.seeds, "ticks": config.train.ticks,
+        "iqm": float(iqm(returns)), "low": low, "high": high, "mean": float(returns.mean()),
+        "diverged": int(np.isnan(returns).sum()), "untrained": float(first.mean()),
+        "per_seed": " ".join(f"{x:.5g}" for x in returns),
+    }  # fmt: skip
+
+
+def _chunks(config: Config, axes: list[Axis], plan: Plan, run_dir: Path, table: list[dict[str, Any]]) -> Iterator[int]:
+    """Yield the chunks to run, in order; where Optuna asks, tell it of each and let it ask for the next."""
+    if not plan.optuna:
+        yield from range(len(plan.chunks))
+        return
+    from taic_jax.sweep.asking import Study
+
+    study, told = Study(axes, run_dir, config.seed), 0
+    chunk = 0
+    while True:
+        while chunk < len(plan.chunks):
+            yield chunk
+            chunk += 1
+            for row in table[told:]:
+                study.tell(plan.trials[row["point"]], row["iqm"])
+            told = len(table)
+        wanted = min(plan.size, plan.optuna - len(plan.points))
+        if wanted <= 0:
+            return
+        first = len(plan.points)
+        trials, points = study.ask(wanted)
+        configs_of(config, points)
+        plan.trials += trials
+        plan.points += points
+        plan.chunks += [[first + i for i in group] for group in chunks(points, plan.size)]
+        plan.save(run_dir)
+
+
+def _resumed(plan: Plan, run_dir: Path) -> Plan:
+    """Return the plan of the sweep in the folder.
+
+    Raises:
+      RunFolderError: there is none, or it is of other axes.
+    """
+    try:
+        saved = Plan(**json.loads((run_dir / PLAN).read_text()))
+    except (OSError, ValueError, TypeError):
+        raise RunFolderError(f"{run_dir} holds no sweep to resume: no {PLAN} in it") from None
+    for name in ("axes", "samples", "optuna"):
+        if getattr(saved, name) != getattr(plan, name):
+            raise RunFolderError(
+                f"{run_dir} was run with other points: --{name} was {getattr(saved, name)}, got {getattr(plan, name)}"
+            )
+    return saved
+
+
+def _write_table(path: Path, table: list[dict[str, Any]]) -> None:
+    text = io.StringIO(newline="")
+    writer = csv.DictWriter(text, list(table[0]), lineterminator="\n")
+    writer.writeheader()
+    for row in sorted(table, key=lambda row: row["point"]):
+        writer.writerow({name: f"{x:.5g}" if isinstance(x, float) else x for name, x in row.items()})
+    save_text(path, text.getvalue())
