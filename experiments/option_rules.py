@@ -19,7 +19,7 @@ import tyro
 
 from taic_jax import option_space
 from taic_jax.artifacts import load_options
-from taic_jax.config import CollectConfig, Config, EvaluateConfig
+from taic_jax.config import CollectConfig, Config, EvaluateConfig, OptionsConfig
 from taic_jax.config_io import load_config
 from taic_jax.experience import read_experience
 from taic_jax.logging import RunLogger
@@ -88,6 +88,7 @@ def collector(arguments: Arguments, task: str, strength: str) -> Config:
     return dataclasses.replace(
         config,
         collect=CollectConfig(ticks=arguments.ticks, capacity=arguments.ticks, ppo=ppo),
+        options=OptionsConfig(),  # what differs is told below; no preset may change it
         train=dataclasses.replace(config.train, ticks=arguments.ticks, baselines=()),
         evaluate=EvaluateConfig(episodes=20, video_ticks=0),
         seed=arguments.seed,

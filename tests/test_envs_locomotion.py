@@ -145,6 +145,7 @@ def test_divergence_ends_the_episode_in_the_last_finite_state(name, monkeypatch,
     state = state.replace(physics=state.physics.replace(qvel=state.physics.qvel.at[0, 0].set(1e12)))
     after = step(state, jnp.zeros((2, env.action_size)))
     np.testing.assert_array_equal(after.terminated, [True, False])
+    np.testing.assert_array_equal(after.metrics["unstable"], [1.0, 0.0])
     np.testing.assert_array_equal(after.physics.qpos[0], state.physics.qpos[0])
     assert after.metrics["forward_reward"][0] == 0.0 and np.isfinite(after.obs).all()
     again = step(state, jnp.zeros((2, env.action_size)))

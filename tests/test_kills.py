@@ -1,0 +1,20 @@
+"""Killed at random moments, resumed, the same to the last bit; `experiments.kills` does it at length."""
+
+import sys
+
+import pytest
+
+from taic_jax.experiments import kills
+
+
+@pytest.mark.timeout(600)
+def test_five_killed_runs_end_as_if_they_had_not_been(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["kills", "--kills", "5", "--iterations", "6", "--seeds", "1"])
+    assert kills.main() == 0
+    assert "5 resumed runs identical, 0 not" in capsys.readouterr().out
+
+
+def test_differences_are_found():
+    whole = {"rows": [1], "collect/0/params": b"a", "methods": {}}
+    assert kills.differences(whole, whole) == []
+    assert kills.differences(whole, {"rows": [1], "collect/0/params": b"b"}) == ["collect/0/params", "methods"]
