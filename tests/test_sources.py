@@ -80,7 +80,7 @@ def test_two_runs_and_demonstrations_are_merged():
     np.testing.assert_allclose(mean_states(), [(4.5 + 104.5 + 1009.5) / 3, (4.5 + 105.5 + 1009.5) / 3], rtol=0.01)
     assert {path.name for path in Path("new/checkpoints").iterdir()} == {"learn", "train"}
     assert not Path("new/experience").exists()
-    assert np.isfinite(last_state(Path("new").absolute(), "train")["params.log_std"]).all()
+    assert np.isfinite(last_state(Path("new").absolute(), "train")["state.params.log_std"]).all()
 
 
 def test_demonstrations_alone_teach_every_seed():

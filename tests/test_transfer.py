@@ -20,7 +20,7 @@ from tiny_runs import (
     with_fields,
 )
 
-from taic_jax import pipeline
+from taic_jax import guard, pipeline
 from taic_jax.checkpoint import Checkpoints
 from taic_jax.config import Config, collector_is_baseline, needs_collect
 from taic_jax.pipeline import make_envs, run_pipeline
@@ -101,16 +101,15 @@ def test_the_transferred_policy_starts_where_the_source_run_ended(source, transf
 
     def drive(run, stage, step, state, *args, **kwargs):
         states.append(state)
+        run.stop(stage, guard.begin(state, run.inherited(stage)), 1)
         return state
 
     env = make_envs(config)[0]
     _, policy = pipeline.take_over(config, env, env)
-    monkeypatch.setattr(
-        pipeline, "drive", lambda run, stage, step, state, *args, **kwargs: states.append(state) or state
-    )
+    monkeypatch.setattr(pipeline, "drive", drive)
     keys = jnp.stack([jax.random.key(k) for k in range(2)])
     with pipeline.RunLogger(transferred.with_name("unused")) as logger:
-        run = pipeline.Run(pipeline.as_arrays(config), keys, transferred, logger, pipeline.Clock())
+        run = pipeline.Run(pipeline.as_rows([config], 2), keys, transferred, logger, pipeline.Clock())
         pipeline.train_baseline(run, env, "transfer", policy)
     saved, (start,) = ocp.load(source / "policy"), states
     first, second = (saved[f"0.actor.params.Dense_{i}.kernel"] for i in range(2))

@@ -31,7 +31,7 @@ def _draw(panel: Any, axis: Axis, values: list[Any], scores: np.ndarray) -> None
     panel.plot(x, scores, "o", color="0.4", markersize=4)
     if not axis.is_range:
         named = [value if numeric else str(value) for value in axis.values]
-        tried = [value for value in named if value in x]
+        tried = [value for value in named if np.isfinite(scores[x == value]).any()]
         panel.plot(tried, [np.nanmedian(scores[x == value]) for value in tried], "-", color="C0")
     if numeric and x.min() > 0 and (axis.logarithmic or x.max() / x.min() >= 10):
         panel.set_xscale("log")
