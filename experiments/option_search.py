@@ -8,7 +8,6 @@ Learns options from a run's experience at each point, trains over them for --tra
 
 import csv
 import dataclasses
-import itertools
 import sys
 import time
 from collections.abc import Sequence
@@ -22,7 +21,7 @@ import numpy as np
 import tyro
 
 from taic_jax.config import Config, ConfigError, walk
-from taic_jax.config_io import closest, load_config
+from taic_jax.config_io import load_config
 from taic_jax.envs.base import Env
 from taic_jax.evaluate import evaluate
 from taic_jax.experience import gather_experience
@@ -32,6 +31,7 @@ from taic_jax.options.learning import learn
 from taic_jax.pipeline import make_envs
 from taic_jax.rl import ppo
 from taic_jax.summary import commit
+from taic_jax.sweep.axes import configs_of, grid, is_leaf, parse_axis, replace
 from taic_jax.types import as_arrays
 from taic_jax.validation import validate
 
@@ -54,31 +54,6 @@ class Arguments:
     out: Path = Path("experiments/results/option_search.csv")
     """The table."""
     config: Annotated[Config, tyro.conf.arg(name=""), tyro.conf.FlagConversionOff] = Config()
-
-
-def parse_grid(grid: Sequence[str]) -> dict[str, list[float]]:
-    """Return the values of each named leaf.
-
-    Raises:
-      ConfigError: a name is no leaf field, or a value is no number.
-    """
-    leaves = [name for name, value in walk(Config()) if type(value) is float]
-    result = {}
-    for axis in grid:
-        name, _, values = axis.partition("=")
-        if name not in leaves:
-            raise ConfigError(f"--grid: expected a leaf field, got {name!r}; the nearest is {closest(name, leaves)}")
-        try:
-            result[name] = [float(value) for value in values.split(",")]
-        except ValueError:
-            raise ConfigError(f"--grid {name}: expected numbers with commas between, got {values!r}") from None
-    return result
-
-
-def replace(config: Any, name: str, value: Any) -> Any:
-    """Replace the field of this dotted name."""
-    first, _, rest = name.partition(".")
-    return dataclasses.replace(config, **{first: replace(getattr(config, first), rest, value) if rest else value})
 
 
 def score(env: Env, config: Config, experience: Experience, key: jax.Array) -> dict[str, jax.Array]:
@@ -106,32 +81,30 @@ def search(arguments: Arguments, config: Config) -> list[dict[str, Any]]:
     """
     started = time.time()
     env, _ = make_envs(config)
-    grid = parse_grid(arguments.grid)
-    points = list(itertools.product(*grid.values()))
-    for point in points:
-        one = config
-        for name, value in zip(grid, point, strict=True):
-            one = replace(one, name, value)
-        validate(one)
+    points = grid([parse_axis(text) for text in arguments.grid])
+    for name in points[0]:
+        if not is_leaf(name):
+            raise ConfigError(f"--grid: expected fields that one program can vary, got {name}")
+    configs_of(config, points)
     swept, axes = as_arrays(config), jax.tree.map(lambda _: None, as_arrays(config))
-    for i, name in enumerate(grid):
-        swept = replace(swept, name, jnp.array([point[i] for point in points], jnp.float32))
+    for name in points[0]:
+        swept = replace(swept, name, jnp.array([point[name] for point in points], jnp.float32))
         axes = replace(axes, name, 0)
     experience = jax.tree.map(jnp.asarray, gather_experience(arguments.experience, env, config.seeds))
     keys = jnp.stack([jax.random.key(config.seed + k) for k in range(config.seeds)])
     over_seeds = jax.vmap(partial(score, env), in_axes=(None, 0, 0))
-    over_points = jax.vmap(over_seeds, in_axes=(axes, None, None)) if grid else over_seeds
+    over_points = jax.vmap(over_seeds, in_axes=(axes, None, None)) if points[0] else over_seeds
     scores = jax.device_get(jax.jit(over_points)(swept, experience, keys))
     seconds = round(time.time() - started)
     rows = []
     for i, point in enumerate(points):
-        settings = {**_changes(arguments), **dict(zip(grid, point, strict=True))}
+        settings = {**_changes(arguments), **point}
         row = {
             "task": config.env.name, "point": " ".join(f"{k}={v}" for k, v in settings.items()),
             "seeds": config.seeds, "ticks": config.train.ticks, "seconds": seconds, "commit": commit(),
         }  # fmt: skip
         for name, values in scores.items():
-            row[name] = " ".join(f"{x:.4g}" for x in np.atleast_1d(values[i] if grid else values))
+            row[name] = " ".join(f"{x:.4g}" for x in np.atleast_1d(values[i] if points[0] else values))
         rows.append(row)
     return rows
 

@@ -155,7 +155,7 @@ def _train(
     Where it begins from another's policy, that explores afresh: the standard deviation is the config's.
     """
     config, level = run.config, make_level(run.config, env, stage)
-    init, step, assess, agent = (over_rows(env, stage, name) for name in ("init", "step", "assess", "agent"))
+    init, assess, agent = (over_rows(env, stage, name) for name in ("init", "assess", "agent"))
     state = jax.jit(init)(config, run.stage_keys(stage), *model)
     if begin:
         params = begin[0].replace(log_std=state.params.log_std)
@@ -164,7 +164,7 @@ def _train(
     assess = run.compile(assess, *given, state, *model)
     first = jax.device_get(assess(*given, state, *model))
     state = drive(
-        run, stage, lambda state, config, *model: step(config, state, *model), state, config, *model,
+        run, stage, step_over_rows(env, stage), state, config, *model,
         num_steps=level.num_steps, unit=level.unit, ticks=level.unit * len(run.keys), after=after,
     )  # fmt: skip
     last = jax.device_get(assess(*given, state, *model))
@@ -177,6 +177,12 @@ def _train(
 def over_rows(env: Env, stage: str, method: str) -> Callable[..., Any]:
     """Return a method of a stage's level as a function of rows: (configs, *its arguments)."""
     return jax.vmap(partial(_call, env, stage, method))
+
+
+def step_over_rows(env: Env, stage: str) -> Callable[..., Any]:
+    """Return a step of a stage's level as `drive` takes it: (states, configs, *models)."""
+    step = over_rows(env, stage, "step")
+    return lambda state, config, *model: step(config, state, *model)
 
 
 def _call(env: Env, stage: str, method: str, config: Config, *args: Any) -> Any:

@@ -15,9 +15,9 @@ from taic_jax.envs.base import Env
 from taic_jax.guard import FINITE, QUANTITIES
 from taic_jax.logging import RunLogger
 from taic_jax.options.model import make_networks
-from taic_jax.pipeline import learn_over_rows, make_envs, over_rows, select_windows
+from taic_jax.pipeline import learn_over_rows, make_envs, over_rows, select_windows, step_over_rows
 from taic_jax.stage import Clock, Run
-from taic_jax.types import as_rows
+from taic_jax.types import as_arrays, as_rows
 
 FIELDS = ("stage", "seed", "seeds", "step", "after", "quantity")
 
@@ -37,14 +37,13 @@ def replay(dump: Path) -> str | None:
     env, source = make_envs(config)
     keys = jnp.stack([jax.random.key(config.seed + k) for k in range(told["seeds"])])
     with RunLogger(run_dir, quiet=True) as logger:
-        run = Run(as_rows([config], told["seeds"]), keys, run_dir, logger, Clock())
+        # As many seeds as there were, all in this state and of this point: the program is the one that failed.
+        row = load_tree(dump / "config", jax.eval_shape(as_arrays, config))
+        run = Run(as_rows([row], told["seeds"]), keys, run_dir, logger, Clock())
         step, like, args = _stage(run, env, source, told["stage"])
-        like = jax.eval_shape(lambda rows: jax.tree.map(lambda x: x[0], rows), {"state": like, "config": run.config})
-        # As many seeds as there were, all in this state: the program is the one that failed.
-        seeds = told["seeds"]
-        rows = jax.tree.map(lambda x: jnp.broadcast_to(x, (seeds, *x.shape)), load_tree(dump, like))
-        given = (rows["state"], rows["config"].options if told["stage"] == "learn" else rows["config"], *args)
-        _, metrics, extra = run.compile(step, *given)(*given)
+        state = load_tree(dump / "state", jax.eval_shape(lambda rows: jax.tree.map(lambda x: x[0], rows), like))
+        states = jax.tree.map(lambda x: jnp.broadcast_to(x, (told["seeds"], *x.shape)), state)
+        _, metrics, extra = run.compile(step, states, *args)(states, *args)
     seed, code = told["seed"], int(metrics["nonfinite"][told["seed"]])
     if code == FINITE:
         return None
@@ -54,17 +53,17 @@ def replay(dump: Path) -> str | None:
 
 
 def _stage(run: Run, env: Env, source: Env, stage: str) -> tuple[Any, Any, tuple]:
-    """Return a stage's step (states, configs, ...), the shapes of its states, and its other arguments."""
+    """Return a stage's step (states, configs, ...), the shapes of its states, and its arguments behind them."""
     config, keys = run.config, run.stage_keys(stage)
     if stage == "learn":
         networks = make_networks(config.options, source.proprioceptive_size, source.action_size)
         init, steps = learn_over_rows(config.options, networks)
-        return steps, jax.eval_shape(init, config.options, keys), (select_windows(run, source),)
+        return steps, jax.eval_shape(init, config.options, keys), (config.options, select_windows(run, source))
     task = source if stage == "collect" else env
     folder = Path(config.options.source or run.dir)
     model = (load_options(folder, env, config.options, len(keys)),) if stage == "train" else ()
-    init, step = over_rows(task, stage, "init"), over_rows(task, stage, "step")
-    return lambda state, config, *model: step(config, state, *model), jax.eval_shape(init, config, keys, *model), model
+    init = over_rows(task, stage, "init")
+    return step_over_rows(task, stage), jax.eval_shape(init, config, keys, *model), (config, *model)
 
 
 def _read(dump: Path) -> dict[str, Any]:

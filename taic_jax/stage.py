@@ -88,7 +88,8 @@ class Run:
             folder = self.dir / DUMPS / f"{stage}-{steps[seed] * unit}-seed{seed}"
             told = {"stage": stage, "seed": int(seed), "seeds": len(codes), "step": int(steps[seed])}
             told |= {"after": int(steps[seed] * unit), "quantity": QUANTITIES[codes[seed]]}
-            save_tree(folder, jax.tree.map(lambda x, k=seed: x[k], {"state": guard.state, "config": self.config}))
+            for name, rows in {"state": guard.state, "config": self.config}.items():
+                save_tree(folder / name, jax.tree.map(lambda x, k=seed: x[k], rows))
             save_text(folder / "description.json", json.dumps(told, indent=2) + "\n")
             print(
                 f"taic_jax: seed {seed} stopped in {stage} after {told['after']:,}: its {told['quantity']} is not "

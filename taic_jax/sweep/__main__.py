@@ -13,7 +13,6 @@ from taic_jax.config import ConfigError
 from taic_jax.sweep.axes import Axis, chunks, configs_of, grid, parse_axis, sample
 
 PROGRAM = "python -m taic_jax.sweep"
-PLAN, TABLE = "plan.json", "table.csv"
 
 
 @dataclass(frozen=True)
@@ -46,9 +45,10 @@ def execute(command: Command) -> int:
         points = sample(axes, command.samples, command.config.seed) if command.samples else grid(axes)
         configs_of(command.config, points)
     from taic_jax.sweep.memory import points_that_fit
-    from taic_jax.sweep.runs import Plan, run_sweep
+    from taic_jax.sweep.runs import TABLE, Plan, run_sweep
 
-    size = command.chunk or points_that_fit(command.config, command.memory)
+    # A sweep that is resumed keeps the chunks that it had: there is nothing to measure.
+    size = command.chunk or (1 if command.resume else points_that_fit(command.config, command.memory))
     plan = Plan(list(command.axes), command.samples, command.optuna, size, points, chunks(points, size))
     if command.dry_run:
         print(plan.tell(command.config))

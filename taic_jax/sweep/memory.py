@@ -39,14 +39,13 @@ def points_that_fit(config: Config, memory: int) -> int:
 
 
 def row_bytes(config: Config) -> int:
-    """Return the bytes that the hungriest program takes for one row: its arguments, results and scratch."""
+    """Return the bytes that one row takes at most in flat PPO and in selecting windows: arguments, results, scratch."""
     env, source = make_envs(config)
     rows = as_rows([config], 1)
     keys = jax.random.split(jax.random.key(0), 1)
-    sizes = [0]
+    sizes = [_step_bytes(rows, env, "flat", keys)]
     if needs_collect(config):
         sizes.append(_step_bytes(rows, source, "collect", keys))
-    sizes.append(_step_bytes(rows, env, config.train.baselines[0] if config.train.baselines else "collect", keys))
     if not config.options.source:
         sizes.append(_program_bytes(jax.vmap(make_dataset), _experience(config, source), rows.options))
     return max(sizes)
