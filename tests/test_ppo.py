@@ -145,7 +145,7 @@ def test_durations_are_counted_where_options_take_more_than_a_tick(iterate, firs
     assert set(of_flat) == set(metrics) - {"durations"}
 
 
-def test_metrics_of_the_task_are_means_over_its_ticks(first_state):
+def test_metrics_of_the_task_are_means_over_its_ticks(iterate, first_state):
     _, metrics, ticks = iterate(first_state)
     assert np.std(ticks.final_obs[..., -1]) > 0
     np.testing.assert_allclose(metrics["mean/last"], np.mean(ticks.final_obs[..., -1]), rtol=1e-5)
