@@ -19,6 +19,7 @@ import tyro
 
 from taic_jax import option_space
 from taic_jax.artifacts import load_options
+from taic_jax.compilation import keep_programs
 from taic_jax.config import CollectConfig, Config, EvaluateConfig, OptionsConfig
 from taic_jax.config_io import load_config
 from taic_jax.experience import read_experience
@@ -200,6 +201,7 @@ def show(rows: list[dict[str, str]]) -> None:
 def main() -> None:
     """Run what is missing, a row at a time, and print the table."""
     arguments = tyro.cli(Arguments)
+    keep_programs()
     for task in arguments.tasks:
         for kind in wanted(arguments, task):
             size = (str(arguments.seeds), str(arguments.ticks))

@@ -45,6 +45,7 @@ def execute(command: Command) -> int:
         found = replay(command.replay)
         print(found or f"{command.replay}: all numbers were finite this time")
         return 0 if found else FAILED
+    from taic_jax.compilation import keep_programs
     from taic_jax.pipeline import make_envs, run_pipeline
     from taic_jax.summary import plan
 
@@ -52,6 +53,7 @@ def execute(command: Command) -> int:
         print(to_yaml(command.config))
         print(plan(command.config, *make_envs(command.config)))
         return 0
+    keep_programs()
     run_dir = command.folder
     code = attempt(
         lambda signals: run_pipeline(

@@ -3,6 +3,7 @@
 import ctypes.util
 import os
 from collections.abc import Callable
+from pathlib import Path
 
 import beartype
 import hypothesis
@@ -14,7 +15,17 @@ if "DISPLAY" not in os.environ:
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
-# Programs are tiny here and run once or twice, so nearly all the time goes into compiling them.
+# Programs are tiny here and run once or twice, so nearly all the time goes into compiling them. Each is compiled once,
+# for this process and for those that tests start.
+CACHE = {
+    "jax_compilation_cache_dir": str(Path(__file__).parents[1] / ".pytest_cache/programs"),
+    "jax_compilation_cache_max_size": 2**30,
+    "jax_persistent_cache_min_compile_time_secs": 0.0,
+    "jax_persistent_cache_min_entry_size_bytes": -1,
+}
+for _name, _value in CACHE.items():
+    jax.config.update(_name, _value)
+    os.environ[_name.upper()] = str(_value)
 jax.config.update("jax_disable_most_optimizations", True)
 os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_use_fusion_emitters=false"
 

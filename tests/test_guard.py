@@ -34,8 +34,8 @@ SEED = 0
 
 
 @pytest.fixture(scope="module", autouse=True)
-def compiled_once(tmp_path_factory):
-    with tiny_steps(tmp_path_factory.mktemp("compiled")):
+def tiny():
+    with tiny_steps():
         yield
 
 

@@ -20,8 +20,8 @@ from taic_jax.run import main
 
 
 @pytest.fixture(scope="module", autouse=True)
-def compiled_once(tmp_path_factory):
-    with tiny_steps(tmp_path_factory.mktemp("compiled")):
+def tiny():
+    with tiny_steps():
         yield
 
 

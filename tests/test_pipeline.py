@@ -28,8 +28,8 @@ STAGES = {"collect": 3, "learn": 2, "train": 3}
 
 
 @pytest.fixture(scope="module", autouse=True)
-def compiled_once(tmp_path_factory):
-    with tiny_steps(tmp_path_factory.mktemp("compiled")):
+def tiny():
+    with tiny_steps():
         yield
 
 

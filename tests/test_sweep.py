@@ -33,8 +33,8 @@ FEW = ["--chunk", "2", "--checkpoint-seconds", "0"]
 
 
 @pytest.fixture(scope="module", autouse=True)
-def compiled_once(tmp_path_factory):
-    with tiny_steps(tmp_path_factory.mktemp("compiled")):
+def tiny():
+    with tiny_steps():
         yield
 
 

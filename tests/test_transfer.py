@@ -32,8 +32,8 @@ SOURCE = with_fields(QUIET, env__name="nav2d_random", options__steps=0)  # a ran
 
 
 @pytest.fixture(scope="module", autouse=True)
-def compiled_once(tmp_path_factory):
-    with tiny_steps(tmp_path_factory.mktemp("compiled")):
+def tiny():
+    with tiny_steps():
         yield
 
 

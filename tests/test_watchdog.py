@@ -5,6 +5,7 @@ import time
 
 import jax
 import jax.numpy as jnp
+import mujoco.batch
 
 from taic_jax.envs import make_env
 from taic_jax.envs.physics import mujoco as backend
@@ -40,12 +41,11 @@ def test_its_thread_ends_with_it():
 
 def test_a_hanging_engine_is_told_with_a_remedy(monkeypatch, capfd):
     monkeypatch.setattr(backend, "PATIENCE", 0.2)
-    env = make_env("hopper", "mujoco")
+    env = make_env("hopper", "mujoco", num_threads=3)  # an engine that no other test has made
     state = jax.jit(env.reset)(jax.random.key(0))
     step = jax.jit(env.step)
     jax.block_until_ready(step(state, jnp.zeros(3)))
-    batch, _ = env.physics._batch(1)
-    monkeypatch.setattr(type(batch), "step", lambda *args, **kwargs: time.sleep(0.6))
+    monkeypatch.setattr(mujoco.batch.Batch, "step", lambda *args, **kwargs: time.sleep(0.6))
     jax.block_until_ready(step(state, jnp.zeros(3)))
     err = capfd.readouterr().err
     assert err.count("\n") == 1 and "--resume" in err and "--env.num-threads 1" in err

@@ -6,10 +6,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 import pytest
-from jax.experimental.compilation_cache import compilation_cache
 from orbax.checkpoint import v1 as ocp
 
 from taic_jax import pipeline, stage
@@ -39,24 +37,12 @@ def _replace(config: Any, path: list[str], value: Any) -> Any:
 
 
 @contextlib.contextmanager
-def tiny_steps(cache: Path) -> Iterator[None]:
-    """Compile each program once for all runs here, save a checkpoint at every step, and log every second one."""
-    settings = {
-        "jax_compilation_cache_dir": str(cache),
-        "jax_persistent_cache_min_compile_time_secs": 0.0,
-        "jax_persistent_cache_min_entry_size_bytes": -1,
-    }
-    before = {name: getattr(jax.config, name) for name in settings}
+def tiny_steps() -> Iterator[None]:
+    """Save a checkpoint at every step, and log every second one."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(stage, "CHECKPOINT_SECONDS", 0.0)
         patch.setattr(pipeline, "STEPS_PER_LOG", 2)
-        for name, value in settings.items():
-            jax.config.update(name, value)
-        compilation_cache.reset_cache()
         yield
-    for name, value in before.items():
-        jax.config.update(name, value)
-    compilation_cache.reset_cache()
 
 
 class KilledError(Exception):

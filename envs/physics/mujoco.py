@@ -1,9 +1,9 @@
 """MuJoCo's C engine on all cores, called from inside a jitted program."""
 
+import functools
+import hashlib
 import os
-import threading
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -11,11 +11,11 @@ import mujoco
 import mujoco.batch
 import numpy as np
 from jax import Array
-from jax.experimental.buffer_callback import buffer_callback
 from jaxtyping import Float
 
 from taic_jax.envs.base import PhysicsState
 from taic_jax.envs.physics.base import Physics
+from taic_jax.envs.physics.host_call import HostCall
 from taic_jax.envs.physics.watchdog import Watchdog
 
 # What a call sends, in the order of MuJoCo's state rows, where only the time precedes it.
@@ -40,18 +40,18 @@ LATE = (
 
 
 class MujocoPhysics(Physics):
-    """A host callback over `mujoco.batch.Batch`; all leading axes (seeds, environments) are one engine call.
+    """A host call of `mujoco.batch.Batch`; all leading axes (seeds, environments) are one engine call.
 
     It is pure: what the engine keeps between calls is scratch. Each call overwrites every state field that
     `mj_step` reads (qpos, qvel, qacc_warmstart, ctrl). The others never change: models with activations,
     mocap bodies, plugins or equalities are refused, no forces are applied, and the time enters no force. So
     the result depends on the arguments alone, at any number of threads. A simulation that diverges comes back
-    as NaN. Calls are serialised, since a `Batch` serves one caller at a time.
+    as NaN.
 
     Args:
-      model: compiled model.
+      model: compiled model; what changes in it later has no effect.
       substeps: engine steps a tick.
-      num_threads: threads that step simulations; 0 takes one per physical core.
+      num_threads: threads that step simulations; 0 shares the physical cores between JAX's devices.
 
     Raises:
       ValueError: if the model has state that `PhysicsState` does not carry.
@@ -61,54 +61,85 @@ class MujocoPhysics(Physics):
         if model.na or model.nhistory or model.nmocap or model.nplugin or model.neq:
             raise ValueError("the model must have no activations, mocap bodies, plugins or equalities")
         super().__init__(model, substeps)
-        self.num_threads = num_threads or num_physical_cores()
-        self._lock = threading.Lock()
-        self._watchdog = Watchdog(PATIENCE, LATE)
-        self._batches: dict[int, tuple[mujoco.batch.Batch, np.ndarray]] = {}
+        self.num_threads = num_threads or max(1, num_physical_cores() // jax.local_device_count())
+        self.engine = _engine(_as_bytes(model), substeps, self.num_threads)
 
     def step(self, state: PhysicsState, ctrl: Float[Array, " nu"]) -> PhysicsState:
         """Advance by one tick under constant controls."""
         nq, nv = self.model.nq, self.model.nv
-        sent = jnp.concatenate([state.qpos, state.qvel, state.qacc_warmstart, ctrl])
-        shape = jax.ShapeDtypeStruct((nq + 2 * nv,), jnp.float32)
         after = jax.lax.platform_dependent(
-            sent,
-            cpu=buffer_callback(self._step_buffer, shape, vmap_method="broadcast_all"),
-            default=lambda sent: jax.pure_callback(self._step_copy, shape, sent, vmap_method="broadcast_all"),
+            jnp.concatenate([state.qpos, state.qvel, state.qacc_warmstart, ctrl]),
+            cpu=self._step_here,
+            default=self._step_elsewhere,
         )
         return state.replace(qpos=after[:nq], qvel=after[nq : nq + nv], qacc_warmstart=after[nq + nv :])
 
-    def _step_buffer(self, context: Any, after: Any, sent: Any) -> None:
+    def _step_here(self, sent: Float[Array, " n"]) -> Float[Array, " m"]:
         """Step in XLA's own memory: on CPU, where `pure_callback` takes ten times as long to hand arrays over."""
-        self._step(np.asarray(sent), np.asarray(after))
+        return self.engine.call(sent, self.engine.num_returned)
 
-    def _step_copy(self, sent: Float[Array, "*batch n"]) -> Float[np.ndarray, "*batch m"]:
+    def _step_elsewhere(self, sent: Float[Array, " n"]) -> Float[Array, " m"]:
         """Step simulations whose state comes from an accelerator."""
-        after = np.empty((*sent.shape[:-1], self.model.nq + 2 * self.model.nv), np.float32)
-        self._step(np.asarray(sent), after)
+        shape = jax.ShapeDtypeStruct((self.engine.num_returned,), jnp.float32)
+        return jax.pure_callback(self.engine.copied_step, shape, sent, vmap_method="broadcast_all")
+
+
+class Engine:
+    """What steps a model's simulations on the host: any number in one call, in any number of threads at once.
+
+    Args:
+      name: of its host call; no other engine has it.
+      model: its own.
+      substeps: engine steps a tick.
+      num_threads: of each call.
+    """
+
+    def __init__(self, name: str, model: mujoco.MjModel, substeps: int, num_threads: int):
+        self.num_returned = model.nq + 2 * model.nv
+        self.call = HostCall(name, self.step)
+        self._model, self._substeps, self._num_threads = model, substeps, num_threads
+        self._watchdog = Watchdog(PATIENCE, LATE)
+        self._idle: dict[int, list[mujoco.batch.Batch]] = {}
+        first = mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_TIME.value)
+        self._sent = slice(first, first + mujoco.mj_stateSize(model, _SENT))
+
+    def step(self, sent: Float[np.ndarray, "*batch n"], after: Float[np.ndarray, "*batch m"]) -> None:
+        """Step all simulations. NumPy only: to call JAX here can deadlock."""
+        sent, after = sent.reshape(-1, sent.shape[-1]), after.reshape(-1, after.shape[-1])
+        idle = self._idle.setdefault(len(sent), [])
+        try:
+            batch = idle.pop()  # a batch serves one caller at a time
+        except IndexError:
+            batch = mujoco.batch.Batch(self._model, len(sent), min(self._num_threads, len(sent)))
+        rows = batch.state[:, self._sent]
+        rows[...] = sent
+        with self._watchdog:
+            batch.step(nstep=self._substeps)
+        after[...] = rows[:, : self.num_returned]
+        if batch.warning.any():  # [simulations, kinds, (last info, count)]
+            after[batch.warning[:, _DIVERGED, 1].any(axis=1)] = np.nan
+            batch.warning[...] = 0
+        idle.append(batch)
+
+    def copied_step(self, sent: Float[Array, "*batch n"]) -> Float[np.ndarray, "*batch m"]:
+        """Return the simulations' states after a tick."""
+        after = np.empty((*sent.shape[:-1], self.num_returned), np.float32)
+        self.step(np.asarray(sent), after)
         return after
 
-    def _step(self, sent: Float[np.ndarray, "*batch n"], after: Float[np.ndarray, "*batch m"]) -> None:
-        """Step all simulations on the host. NumPy only: to call JAX in a callback can deadlock."""
-        sent, after = sent.reshape(-1, sent.shape[-1]), after.reshape(-1, after.shape[-1])
-        with self._lock:
-            batch, rows = self._batch(len(sent))
-            rows[...] = sent
-            with self._watchdog:
-                batch.step(nstep=self.substeps)
-            after[...] = rows[:, : after.shape[-1]]
-            if batch.warning.any():  # [simulations, kinds, (last info, count)]
-                after[batch.warning[:, _DIVERGED, 1].any(axis=1)] = np.nan
-                batch.warning[...] = 0
 
-    def _batch(self, num_simulations: int) -> tuple[mujoco.batch.Batch, np.ndarray]:
-        """Return the engine for so many simulations, and the part of its state rows that calls overwrite."""
-        if num_simulations not in self._batches:
-            batch = mujoco.batch.Batch(self.model, num_simulations, min(self.num_threads, num_simulations))
-            start = mujoco.mj_stateSize(self.model, mujoco.mjtState.mjSTATE_TIME.value)
-            stop = start + mujoco.mj_stateSize(self.model, _SENT)
-            self._batches[num_simulations] = batch, batch.state[:, start:stop]
-        return self._batches[num_simulations]
+@functools.cache
+def _engine(model: bytes, substeps: int, num_threads: int) -> Engine:
+    """Return the engine of a saved model: one a process, since compiled programs call it by its name."""
+    digest = hashlib.sha256(model).hexdigest()[:16]
+    loaded = mujoco.MjModel.from_binary_path("model.mjb", {"model.mjb": model})
+    return Engine(f"taic_jax_mujoco_{digest}_{substeps}_{num_threads}", loaded, substeps, num_threads)
+
+
+def _as_bytes(model: mujoco.MjModel) -> bytes:
+    saved = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, saved)
+    return saved.tobytes()
 
 
 def num_physical_cores() -> int:

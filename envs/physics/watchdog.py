@@ -7,9 +7,10 @@ import weakref
 
 
 class Watchdog:
-    """A context around a call; a call that takes longer than `limit` seconds is told on standard error, once.
+    """A context around calls; one that takes longer than `limit` seconds is told on standard error, once.
 
-    One thread looks on from the first call until the watchdog is no longer used. It costs a call two assignments.
+    Several threads may be in it. One more looks on from the first call until the watchdog is no longer used. It costs a
+    call two assignments.
 
     Args:
       limit: in seconds.
@@ -18,21 +19,21 @@ class Watchdog:
 
     def __init__(self, limit: float, message: str):
         self.limit, self.message = limit, message
-        self._since: float | None = None
+        self._since: dict[int, float] = {}  # by the caller's thread
         self._thread: threading.Thread | None = None
 
     def __enter__(self) -> None:
-        self._since = time.monotonic()
+        self._since[threading.get_ident()] = time.monotonic()
         if self._thread is None:
             self._thread = threading.Thread(target=_look_on, args=(weakref.ref(self), self.limit / 4), daemon=True)
             self._thread.start()
 
     def __exit__(self, *_: object) -> None:
-        self._since = None
+        del self._since[threading.get_ident()]
 
     def late(self, told: float | None) -> float | None:
-        """Return when the running call began if it is late, having told of it unless that is `told`."""
-        since = self._since
+        """Return when the longest running call began if it is late, having told of it unless that is `told`."""
+        since = min(self._since.copy().values(), default=None)
         if since is None or time.monotonic() - since < self.limit:
             return None
         if since != told:

@@ -44,9 +44,11 @@ def execute(command: Command) -> int:
     else:
         points = sample(axes, command.samples, command.config.seed) if command.samples else grid(axes)
         configs_of(command.config, points)
+    from taic_jax.compilation import keep_programs
     from taic_jax.sweep.memory import points_that_fit
     from taic_jax.sweep.runs import TABLE, Plan, run_sweep
 
+    keep_programs()
     # A sweep that is resumed keeps the chunks that it had: there is nothing to measure.
     size = command.chunk or (1 if command.resume else points_that_fit(command.config, command.memory))
     plan = Plan(list(command.axes), command.samples, command.optuna, size, points, chunks(points, size))
