@@ -9,6 +9,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Literal
 
+Shard = Literal["none", "seeds", "envs"]
+"""What is split over devices; no part of an experiment, but known here without JAX."""
+
 
 class ConfigError(ValueError):
     """A mistake in a configuration, told in one line."""
