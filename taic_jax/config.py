@@ -229,3 +229,9 @@ def walk(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
             yield from walk(value, f"{prefix}{field.name}.")
         else:
             yield prefix + field.name, value
+
+
+def replace(config: Any, name: str, value: Any) -> Any:
+    """Replace the field of this dotted name."""
+    first, _, rest = name.partition(".")
+    return dataclasses.replace(config, **{first: replace(getattr(config, first), rest, value) if rest else value})

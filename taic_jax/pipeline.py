@@ -57,7 +57,7 @@ def run_pipeline(
       shard: what to split over all devices: these rows, or environments.
       resume: go on with the run in the folder.
       overwrite: replace it.
-      **settings: the `signals` and `checkpoint_seconds` of `stage.Run`.
+      **settings: the `signals`, `checkpoint_seconds` and `population` of `stage.Run`.
 
     Raises:
       Interrupted: a signal was received; resume goes on from where it came.
@@ -168,10 +168,14 @@ def _train(
     place, given = run.devices.place, (config, run.stage_keys("evaluate"))
     assess = run.compile(assess, *place((*given, state, *model)))
     first = jax.device_get(run.rows(assess(*place((*given, state, *model)))))
+    step, population = step_over_rows(env, stage), run.population if stage == "train" else None
+    if population:
+        state, step = population.begin(state, config, run.stage_keys(stage)), population.evolving(step)
     state = drive(
-        run, stage, step_over_rows(env, stage), state, config, *model,
+        run, stage, step, state, config, *model,
         num_steps=level.num_steps, unit=level.unit, ticks=level.unit * len(run.keys), after=after,
     )  # fmt: skip
+    state = state.state if population else state
     last = jax.device_get(run.rows(assess(*place((*given, state, *model)))))
     stopped = run.stopped[stage].code != FINITE
     last = jax.tree.map(lambda x: np.where(stopped.reshape((-1,) + (1,) * (x.ndim - 1)), np.nan, x), last)

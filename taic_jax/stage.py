@@ -19,6 +19,7 @@ from taic_jax.devices import Devices, take
 from taic_jax.guard import FINITE, QUANTITIES, Guarded, begin, guarded
 from taic_jax.interruption import DivergedError, Signals
 from taic_jax.logging import RunLogger
+from taic_jax.population import Members, Population
 
 S = TypeVar("S")
 
@@ -67,6 +68,7 @@ class Run:
     checkpoint_seconds: float = field(default_factory=lambda: CHECKPOINT_SECONDS)
     stopped: dict[str, Stopped] = field(default_factory=dict)
     devices: Devices = Devices()
+    population: Population | None = None
 
     def stage_keys(self, stage: str) -> jax.Array:
         """Return the seeds' keys [K] of one stage; a seed's key does not depend on the number of seeds."""
@@ -94,7 +96,9 @@ class Run:
             folder = self.dir / DUMPS / f"{stage}-{steps[seed] * unit}-seed{seed}"
             told = {"stage": stage, "seed": int(seed), "seeds": len(codes), "step": int(steps[seed])}
             told |= {"after": int(steps[seed] * unit), "quantity": QUANTITIES[codes[seed]]}
-            for name, rows in {"state": guard.state, "config": self.config}.items():
+            evolved = isinstance(guard.state, Members)
+            state, config = (guard.state.state, guard.state.config) if evolved else (guard.state, self.config)
+            for name, rows in {"state": state, "config": config}.items():
                 save_tree(folder / name, jax.tree.map(lambda x, k=seed: x[k], rows))
             save_text(folder / "description.json", json.dumps(told, indent=2) + "\n")
             print(

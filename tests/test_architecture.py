@@ -22,7 +22,7 @@ LAYERS = (
     "options",
     "rl",
     "experience evaluate statistics artifacts demonstrations measures option_space",
-    "logging interruption level",
+    "logging interruption level population",
     "stage summary",
     "pipeline",
     "replay command_line",

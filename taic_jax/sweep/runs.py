@@ -13,14 +13,16 @@ from typing import Any
 import numpy as np
 
 from taic_jax.checkpoint import save_text
-from taic_jax.config import Config
+from taic_jax.config import Config, replace
 from taic_jax.config_io import to_yaml
 from taic_jax.experience import EXPERIENCE
 from taic_jax.interruption import DivergedError
+from taic_jax.logging import read_metrics
 from taic_jax.pipeline import run_pipeline
+from taic_jax.population import Population, schedule
 from taic_jax.run_folder import RunFolderError, claimed, prepare_folder
 from taic_jax.statistics import bootstrap_interval, iqm
-from taic_jax.sweep.axes import Axis, chunks, configs_of, replace, show
+from taic_jax.sweep.axes import Axis, chunks, configs_of, show
 from taic_jax.sweep.marginals import draw_marginals
 
 PLAN, TABLE, BEST, MARGINALS = "plan.json", "table.csv", "best.yaml", "marginals.png"
@@ -40,6 +42,7 @@ class Plan:
     points: list[dict[str, Any]]
     chunks: list[list[int]]
     trials: list[int] = dataclasses.field(default_factory=list)
+    pbt: int = 0
 
     def tell(self, config: Config) -> str:
         """Return the plan in a few lines."""
@@ -70,6 +73,9 @@ def run_sweep(
       RunFolderError: the folder holds another sweep, or none to resume, or another process is at it.
     """
     config = replace(config, "evaluate.video_ticks", 0)
+    if plan.pbt:
+        bounds = {axis.name: axis.bounds for axis in axes}
+        settings["population"] = Population(plan.pbt, bounds, config.seeds)
     prepare_folder(config, run_dir, resume=resume, overwrite=overwrite)
     with claimed(run_dir):
         plan = _resumed(plan, run_dir) if resume else plan
@@ -83,11 +89,33 @@ def run_sweep(
             _write_table(run_dir / TABLE, table)
         finished = [row for row in table if np.isfinite(row["iqm"])]
         if finished:
-            best = max(finished, key=lambda row: row["iqm"])
-            save_text(run_dir / BEST, to_yaml(configs_of(config, [plan.points[best["point"]]])[0]))
-            interval = f"{best['low']:.4g} … {best['high']:.4g}"
-            print(f"best: {show(plan.points[best['point']])}: {best['iqm']:.4g} ({interval})")
+            told = _best_member(config, plan, run_dir) if plan.pbt else _best_point(config, plan, finished)
+            save_text(run_dir / BEST, told)
         draw_marginals(run_dir / MARGINALS, axes, plan.points, {row["point"]: row["iqm"] for row in table})
+
+
+def _best_point(config: Config, plan: Plan, table: list[dict[str, Any]]) -> str:
+    """Tell the point that did best, and return its config."""
+    best = max(table, key=lambda row: row["iqm"])
+    point = plan.points[best["point"]]
+    print(f"best: {show(point)}: {best['iqm']:.4g} ({best['low']:.4g} … {best['high']:.4g})")
+    return to_yaml(configs_of(config, [point])[0])
+
+
+def _best_member(config: Config, plan: Plan, run_dir: Path) -> str:
+    """Tell the member of all populations that did best, and return its last config behind its schedule."""
+    folder = run_dir / "chunk-000"
+    returns = np.array(
+        json.loads((folder / "summary.json").read_text())["methods"]["taic"]["return"]["per_seed"], float
+    )
+    best = int(np.nanargmax(returns))
+    rows = [row for row in read_metrics(folder / "metrics.jsonl") if row["stage"] == "train"]
+    found = schedule(rows, list(plan.points[0]), best)
+    print(f"best: {show(found[-1][1])} at the end: {returns[best]:.4g}, point {plan.chunks[0][best // config.seeds]}")
+    lines = [f"# from tick {tick}: {show(point)}\n" for tick, point in found]
+    return (
+        "# What --pbt found; below, the last of it.\n" + "".join(lines) + to_yaml(configs_of(config, [found[-1][1]])[0])
+    )
 
 
 def run_chunk(config: Config, plan: Plan, chunk: int, run_dir: Path, settings: dict[str, Any]) -> list[dict[str, Any]]:
@@ -160,7 +188,7 @@ def _resumed(plan: Plan, run_dir: Path) -> Plan:
         saved = Plan(**json.loads((run_dir / PLAN).read_text()))
     except (OSError, ValueError, TypeError):
         raise RunFolderError(f"{run_dir} holds no sweep to resume: no {PLAN} in it") from None
-    for name in ("axes", "samples", "optuna"):
+    for name in ("axes", "samples", "optuna", "pbt"):
         if getattr(saved, name) != getattr(plan, name):
             raise RunFolderError(
                 f"{run_dir} was run with other points: --{name} was {getattr(saved, name)}, got {getattr(plan, name)}"
