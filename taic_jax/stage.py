@@ -152,8 +152,7 @@ def drive(
     checkpoints = Checkpoints(run.dir / "checkpoints" / stage)
     guard = begin(state, run.inherited(stage))
     first = checkpoints.latest_step() or 0
-    if first:
-        guard = checkpoints.load(first, guard)
+    guard = checkpoints.load(first, guard) if first else guard
     run.logger.truncate(stage, first * unit)
     known = run.stop(stage, guard, unit)
     if first == num_steps:
