@@ -27,6 +27,8 @@ class Command(command_line.Command):
     """Points that Optuna (extra sweep) asks for, a chunk at a time."""
     pbt: int = 0
     """Iterations of stage train after which, again and again, the worst points take over from the best (0: never)."""
+    cluster: str = ""
+    """HOST:PORT of a Ray cluster (extra cluster) whose nodes share this folder, or local; runs a chunk on each node."""
     memory: int = 0
     """MiB that a chunk of points may take; 0 takes half of what the machine has."""
     chunk: int = 0
@@ -41,6 +43,10 @@ def main(args: Sequence[str] | None = None) -> int:
 def execute(command: Command) -> int:
     """Sweep, or only print the plan; return the exit code."""
     axes = _check(command)
+    if command.cluster and not command.dry_run:
+        from taic_jax.sweep.cluster import connect
+
+        connect(command.cluster)
     if command.optuna:
         points = []
     else:
@@ -65,7 +71,8 @@ def execute(command: Command) -> int:
     code = attempt(
         lambda signals: run_sweep(
             command.config, axes, plan, run_dir, resume=command.resume, overwrite=command.overwrite,
-            signals=signals, checkpoint_seconds=command.checkpoint_seconds, shard=command.shard,
+            on_cluster=bool(command.cluster), signals=signals, checkpoint_seconds=command.checkpoint_seconds,
+            shard=command.shard,
         ),
         run_dir,
     )  # fmt: skip

@@ -6,7 +6,8 @@ import io
 import json
 import shutil
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -64,6 +65,7 @@ def run_sweep(
     *,
     resume: bool = False,
     overwrite: bool = False,
+    on_cluster: bool = False,
     **settings: Any,
 ) -> None:
     """Run what is missing, and write the table after every chunk, the best point and the marginal plots at the end.
@@ -84,9 +86,11 @@ def run_sweep(
             print(f"taic_jax: {run_dir} is finished: see {run_dir / TABLE}", file=sys.stderr)
             return
         table: list[dict[str, Any]] = []
-        for chunk in _chunks(config, axes, plan, run_dir, table):
-            table += run_chunk(config, plan, chunk, run_dir, settings)
-            _write_table(run_dir / TABLE, table)
+        run = _on_cluster if on_cluster else map
+        for batch in _batches(config, axes, plan, run_dir, table):
+            for rows in run(partial(run_chunk, config, plan, run_dir, settings), batch):
+                table += rows
+                _write_table(run_dir / TABLE, table)
         finished = [row for row in table if np.isfinite(row["iqm"])]
         if finished:
             told = _best_member(config, plan, run_dir) if plan.pbt else _best_point(config, plan, finished)
@@ -118,7 +122,7 @@ def _best_member(config: Config, plan: Plan, run_dir: Path) -> str:
     )
 
 
-def run_chunk(config: Config, plan: Plan, chunk: int, run_dir: Path, settings: dict[str, Any]) -> list[dict[str, Any]]:
+def run_chunk(config: Config, plan: Plan, run_dir: Path, settings: dict[str, Any], chunk: int) -> list[dict[str, Any]]:
     """Run one chunk, unless it is done, and return a row per point."""
     folder, which = run_dir / f"chunk-{chunk:03d}", plan.chunks[chunk]
     points = configs_of(config, [plan.points[i] for i in which])
@@ -150,22 +154,37 @@ def _row(plan: Plan, i: int, config: Config, returns: np.ndarray, first: np.ndar
     }  # fmt: skip
 
 
-def _chunks(config: Config, axes: list[Axis], plan: Plan, run_dir: Path, table: list[dict[str, Any]]) -> Iterator[int]:
-    """Yield the chunks to run, in order; where Optuna asks, tell it of each and let it ask for the next."""
+def _on_cluster(work: partial, batch: Sequence[int]) -> Iterator[list[dict[str, Any]]]:
+    """Run the chunks of a batch as tasks of the cluster that this process is connected to."""
+    from taic_jax.sweep.cluster import run_tasks
+
+    config, plan, run_dir, settings = work.args
+    settings = dict(settings)
+    signals = settings.pop("signals", None)  # they are this process's
+    work = partial(run_chunk, config, plan, run_dir.absolute(), settings)
+    return run_tasks(work, [(chunk,) for chunk in batch], signals)
+
+
+def _batches(
+    config: Config, axes: list[Axis], plan: Plan, run_dir: Path, table: list[dict[str, Any]]
+) -> Iterator[Sequence[int]]:
+    """Yield the chunks to run; where Optuna asks, those it asked for, and tell it of them before it asks for the next.
+
+    Chunks of one batch may run in any order, or at once.
+    """
     if not plan.optuna:
-        yield from range(len(plan.chunks))
+        yield range(len(plan.chunks))
         return
     from taic_jax.sweep.asking import Study
 
     study, told = Study(axes, run_dir, config.seed), 0
     chunk = 0
     while True:
-        while chunk < len(plan.chunks):
-            yield chunk
-            chunk += 1
-            for row in table[told:]:
-                study.tell(plan.trials[row["point"]], row["iqm"])
-            told = len(table)
+        yield range(chunk, len(plan.chunks))
+        chunk = len(plan.chunks)
+        for row in table[told:]:
+            study.tell(plan.trials[row["point"]], row["iqm"])
+        told = len(table)
         wanted = min(plan.size, plan.optuna - len(plan.points))
         if wanted <= 0:
             return
