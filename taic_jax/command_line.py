@@ -18,7 +18,7 @@ from typing import Annotated, Any, TypeVar, get_type_hints
 
 import tyro
 
-from taic_jax.config import Config, ConfigError, walk
+from taic_jax.config import Config, ConfigError, Shard, walk
 from taic_jax.config_io import closest, load_config, mistyped, preset_names
 from taic_jax.interruption import DivergedError, Interrupted, Signals
 from taic_jax.validation import validate
@@ -44,6 +44,8 @@ class Command:
     """Print the configuration and the plan, and stop."""
     checkpoint_seconds: float = 30.0
     """Least seconds between two checkpoints of a stage; 0 makes one every iteration."""
+    shard: Shard = "none"
+    """Split over all devices that JAX sees: the seeds (of all points), or the environments of each seed."""
     options: Annotated[str, tyro.conf.arg(metavar="RUN")] = ""
     """Run or artifact whose option model is used as it is; short for --options.source."""
     config: Annotated[Config, tyro.conf.arg(name=""), tyro.conf.FlagConversionOff] = Config()

@@ -9,6 +9,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Literal
 
+Shard = Literal["none", "seeds", "envs"]
+"""What is split over devices; no part of an experiment, but known here without JAX."""
+
 
 class ConfigError(ValueError):
     """A mistake in a configuration, told in one line."""
@@ -226,3 +229,9 @@ def walk(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
             yield from walk(value, f"{prefix}{field.name}.")
         else:
             yield prefix + field.name, value
+
+
+def replace(config: Any, name: str, value: Any) -> Any:
+    """Replace the field of this dotted name."""
+    first, _, rest = name.partition(".")
+    return dataclasses.replace(config, **{first: replace(getattr(config, first), rest, value) if rest else value})

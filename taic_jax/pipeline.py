@@ -14,7 +14,8 @@ import numpy as np
 
 from taic_jax.artifacts import OPTIONS, POLICY, describe, load_options, load_policy, save_options, save_policy
 from taic_jax.checkpoint import save_text
-from taic_jax.config import COLLECT, Config, ConfigError, OptionsConfig, collector_is_baseline, needs_collect
+from taic_jax.config import COLLECT, Config, ConfigError, OptionsConfig, Shard, collector_is_baseline, needs_collect
+from taic_jax.devices import make_devices
 from taic_jax.envs import environment_options, make_env
 from taic_jax.envs.base import Env
 from taic_jax.envs.errors import RenderingError
@@ -41,6 +42,7 @@ def run_pipeline(
     run_dir: Path,
     *,
     points: Sequence[Config] = (),
+    shard: Shard = "none",
     resume: bool = False,
     overwrite: bool = False,
     **settings: Any,
@@ -52,16 +54,18 @@ def run_pipeline(
       run_dir: its folder.
       points: variants [G] of `config` that differ from it in floats alone, to be run in its place, in one program;
         what is per seed is then of G K rows, one point after another.
+      shard: what to split over all devices: these rows, or environments.
       resume: go on with the run in the folder.
       overwrite: replace it.
-      **settings: the `signals` and `checkpoint_seconds` of `stage.Run`.
+      **settings: the `signals`, `checkpoint_seconds` and `population` of `stage.Run`.
 
     Raises:
       Interrupted: a signal was received; resume goes on from where it came.
       RunFolderError: the folder holds another run, or none to resume, or another process is at it.
-      ConfigError: the config does not fit the environment.
+      ConfigError: the config does not fit the environment, or the devices.
       ArtifactError: another run does not hold what the config takes from it.
     """
+    devices = make_devices(shard, config)
     env, source = make_envs(config)
     model, policy = take_over(config, env, source)  # what is refused is refused before anything is written
     prepare_folder(config, run_dir, resume=resume, overwrite=overwrite)
@@ -70,7 +74,8 @@ def run_pipeline(
     keys = jnp.stack([jax.random.key(config.seed + k) for _ in points for k in range(config.seeds)])
     model, policy = _for_points((model, policy), len(points))
     with claimed(run_dir), RunLogger(run_dir) as logger:
-        run = Run(as_rows(points, config.seeds), keys, run_dir, logger, Clock.load(run_dir / CLOCK), **settings)
+        clock = Clock.load(run_dir / CLOCK)
+        run = Run(as_rows(points, config.seeds), keys, run_dir, logger, clock, devices=devices, **settings)
         logger.truncate("evaluate", -1)
         collector = collect(run, source) if needs_collect(config) else None
         model = learn(run, source) if model is None else model
@@ -160,14 +165,18 @@ def _train(
     if begin:
         params = begin[0].replace(log_std=state.params.log_std)
         state = state.replace(params=params, obs_statistics=begin[1])
-    given = config, run.stage_keys("evaluate")
-    assess = run.compile(assess, *given, state, *model)
-    first = jax.device_get(assess(*given, state, *model))
+    place, given = run.devices.place, (config, run.stage_keys("evaluate"))
+    assess = run.compile(assess, *place((*given, state, *model)))
+    first = jax.device_get(run.rows(assess(*place((*given, state, *model)))))
+    step, population = step_over_rows(env, stage), run.population if stage == "train" else None
+    if population:
+        state, step = population.begin(state, config, run.stage_keys(stage)), population.evolving(step)
     state = drive(
-        run, stage, step_over_rows(env, stage), state, config, *model,
+        run, stage, step, state, config, *model,
         num_steps=level.num_steps, unit=level.unit, ticks=level.unit * len(run.keys), after=after,
     )  # fmt: skip
-    last = jax.device_get(assess(*given, state, *model))
+    state = state.state if population else state
+    last = jax.device_get(run.rows(assess(*place((*given, state, *model)))))
     stopped = run.stopped[stage].code != FINITE
     last = jax.tree.map(lambda x: np.where(stopped.reshape((-1,) + (1,) * (x.ndim - 1)), np.nan, x), last)
     run.logger.log("evaluate", level.ticks, {f"{stage}/{name}": x["return"] for name, x in last.items()})
@@ -252,7 +261,8 @@ def select_windows(run: Run, env: Env) -> Dataset:
         else _for_points(gather_experience(Path(name), env, seeds), rows // seeds)
         for name in names
     ]
-    dataset = jax.jit(jax.vmap(make_dataset))(sources, config)
+    given = run.devices.place((sources, config))
+    dataset = run.rows(run.compile(jax.vmap(make_dataset), *given)(*given))
     span = f"in {', '.join(names)} between its shares {jnp.min(config.since):g} and {jnp.max(config.until):g}"
     if not dataset.count.all():
         raise ConfigError(

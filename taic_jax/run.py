@@ -58,7 +58,7 @@ def execute(command: Command) -> int:
     code = attempt(
         lambda signals: run_pipeline(
             command.config, run_dir, resume=command.resume, overwrite=command.overwrite,
-            signals=signals, checkpoint_seconds=command.checkpoint_seconds,
+            signals=signals, checkpoint_seconds=command.checkpoint_seconds, shard=command.shard,
         ),
         run_dir,
     )  # fmt: skip

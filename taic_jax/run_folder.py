@@ -19,6 +19,10 @@ class RunFolderError(ValueError):
     """The run folder cannot be used as asked."""
 
 
+class BusyError(RunFolderError):
+    """Another process is at the run folder."""
+
+
 def prepare_folder(config: Config, run_dir: Path, *, resume: bool = False, overwrite: bool = False) -> None:
     """Make the run folder, or check that it is the one to resume.
 
@@ -53,14 +57,14 @@ def claimed(run_dir: Path) -> Iterator[None]:
     """Keep other processes off a run's folder; the system gives it back when this one ends, however it ends.
 
     Raises:
-      RunFolderError: another process is at it.
+      BusyError: another process is at it.
     """
     with (run_dir / "config.yaml").open() as file:
         if fcntl is not None:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
-                raise RunFolderError(f"{run_dir} is being written by another process; wait for its end") from None
+                raise BusyError(f"{run_dir} is being written by another process; wait for its end") from None
         yield
 
 

@@ -15,9 +15,11 @@ import numpy as np
 
 from taic_jax.checkpoint import Checkpoints, save_text, save_tree
 from taic_jax.config import Config
+from taic_jax.devices import Devices, take
 from taic_jax.guard import FINITE, QUANTITIES, Guarded, begin, guarded
 from taic_jax.interruption import DivergedError, Signals
 from taic_jax.logging import RunLogger
+from taic_jax.population import Members, Population
 
 S = TypeVar("S")
 
@@ -65,10 +67,16 @@ class Run:
     signals: Signals = field(default_factory=Signals)
     checkpoint_seconds: float = field(default_factory=lambda: CHECKPOINT_SECONDS)
     stopped: dict[str, Stopped] = field(default_factory=dict)
+    devices: Devices = Devices()
+    population: Population | None = None
 
     def stage_keys(self, stage: str) -> jax.Array:
         """Return the seeds' keys [K] of one stage; a seed's key does not depend on the number of seeds."""
         return jax.vmap(partial(jax.random.fold_in, data=STAGES.index(stage)))(self.keys)
+
+    def rows(self, tree: S) -> S:
+        """Return the rows of the run's own seeds and points, of those that the devices had."""
+        return take(tree, len(self.keys))
 
     def inherited(self, stage: str) -> jax.Array:
         """Return the codes [K] of the seeds that stopped in what this stage builds on."""
@@ -88,7 +96,9 @@ class Run:
             folder = self.dir / DUMPS / f"{stage}-{steps[seed] * unit}-seed{seed}"
             told = {"stage": stage, "seed": int(seed), "seeds": len(codes), "step": int(steps[seed])}
             told |= {"after": int(steps[seed] * unit), "quantity": QUANTITIES[codes[seed]]}
-            for name, rows in {"state": guard.state, "config": self.config}.items():
+            evolved = isinstance(guard.state, Members)
+            state, config = (guard.state.state, guard.state.config) if evolved else (guard.state, self.config)
+            for name, rows in {"state": state, "config": config}.items():
                 save_tree(folder / name, jax.tree.map(lambda x, k=seed: x[k], rows))
             save_text(folder / "description.json", json.dumps(told, indent=2) + "\n")
             print(
@@ -102,9 +112,9 @@ class Run:
         return codes
 
     def compile(self, function: Callable, *args: Any, donate: bool = False) -> Callable:
-        """Compile ahead of time, so that a call of other shapes or types fails instead of compiling again."""
+        """Compile ahead of time for placed rows; a call of other shapes or types fails instead of compiling again."""
         start = time.perf_counter()
-        compiled = jax.jit(function, donate_argnums=0 if donate else ()).lower(*args).compile()
+        compiled = self.devices.compile(function, *args, donate=donate)
         self.clock.compile += time.perf_counter() - start
         return compiled
 
@@ -142,30 +152,30 @@ def drive(
     checkpoints = Checkpoints(run.dir / "checkpoints" / stage)
     guard = begin(state, run.inherited(stage))
     first = checkpoints.latest_step() or 0
-    if first:
-        guard = checkpoints.load(first, guard)
+    guard = checkpoints.load(first, guard) if first else guard
     run.logger.truncate(stage, first * unit)
     known = run.stop(stage, guard, unit)
     if first == num_steps:
         return guard.state
+    guard, args = run.devices.place((guard, args))
     compiled = run.compile(guarded(step), guard, *args, donate=True)
     saved = time.perf_counter()
     with run.logger.stage(stage, num_steps * unit, done=first * unit):
         for index in range(first, num_steps):
             guard, metrics, extra = compiled(guard, *args)
-            metrics, codes = jax.device_get((metrics, guard.code))
+            metrics, codes = jax.device_get(run.rows((metrics, guard.code)))
             run.logger.log(stage, (index + 1) * unit, metrics, "ticks" if ticks else "steps")
             if after is not None:
-                after(index, extra)
+                after(index, run.rows(extra))
             run.clock.ticks += ticks
             changed = (codes != known).any()
             if changed:
-                known = run.stop(stage, guard, unit, known)
+                known = run.stop(stage, run.rows(guard), unit, known)
             due = time.perf_counter() - saved > run.checkpoint_seconds or index + 1 == num_steps
             if due or changed or run.signals.received:
-                checkpoints.save(index + 1, guard)
+                checkpoints.save(index + 1, run.rows(guard))
                 run.clock.run += time.perf_counter() - saved
                 run.clock.save(run.dir / CLOCK)
                 saved = time.perf_counter()
             run.signals.check()
-    return guard.state
+    return run.rows(guard.state)

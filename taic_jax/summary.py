@@ -120,7 +120,6 @@ def write_video(run: Run, env: Env, agent: Agent) -> None:
     ticks = run.config.evaluate.video_ticks
     if not ticks:
         return
-    agent = jax.tree.map(lambda x: x[0], agent)
-    key = run.stage_keys("video")[0]
-    physics = run.compile(lambda agent, key: record(env, agent, key, ticks), agent, key)(agent, key)
+    agent = jax.device_get(jax.tree.map(lambda x: x[0], agent))
+    physics = jax.jit(lambda agent, key: record(env, agent, key, ticks))(agent, run.stage_keys("video")[0])
     write_webp(run.dir / "video.webp", env.render(jax.device_get(physics)), env.dt)

@@ -27,7 +27,10 @@ for _name, _value in CACHE.items():
     jax.config.update(_name, _value)
     os.environ[_name.upper()] = str(_value)
 jax.config.update("jax_disable_most_optimizations", True)
-os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_use_fusion_emitters=false"
+flags = "--xla_cpu_use_fusion_emitters=false"
+# Two devices to split over; all that does not ask for it is on the first.
+flags += " --xla_force_host_platform_device_count=2"
+os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {flags}"
 
 # The first example of a property compiles, the others do not: a deadline would only measure that.
 hypothesis.settings.register_profile("taic_jax", deadline=None, max_examples=25)

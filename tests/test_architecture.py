@@ -17,12 +17,12 @@ ALL = PACKAGE + sorted((ROOT / "tests").rglob("*.py"))
 # A module imports only from its own layer or from earlier ones. A module that is in none fails the test.
 LAYERS = (
     "envs",
-    "config validation config_io types checkpoint run_folder compilation",
+    "config validation config_io types devices checkpoint run_folder compilation",
     "networks normalize returns guard",
     "options",
     "rl",
     "experience evaluate statistics artifacts demonstrations measures option_space",
-    "logging interruption level",
+    "logging interruption level population",
     "stage summary",
     "pipeline",
     "replay command_line",

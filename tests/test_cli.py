@@ -28,7 +28,7 @@ def pipeline(monkeypatch):
     """Stand in for the pipeline, and record what it is asked to run."""
     calls = []
 
-    def run_pipeline(config, run_dir, *, resume, overwrite, signals, checkpoint_seconds):
+    def run_pipeline(config, run_dir, *, resume, overwrite, signals, checkpoint_seconds, shard):
         calls.append((config, run_dir, resume, overwrite))
 
     fake = types.SimpleNamespace(run_pipeline=run_pipeline, make_envs=lambda config: ("env", "source"))

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float, Key
 
+from taic_jax.devices import over_envs
 from taic_jax.envs.base import Env, State
 from taic_jax.options.execution import Executor
 from taic_jax.types import select
@@ -123,4 +124,5 @@ def rollout(
     """
     num_envs = running.ended.shape[0]
     noise = jax.random.normal(key, (length, num_envs, executor.option_size + executor.noise_size))
-    return jax.lax.scan(partial(_tick, env, executor, decide, keep), running, noise)
+    scan = partial(jax.lax.scan, partial(_tick, env, executor, decide, keep))
+    return over_envs(scan, num_envs)(running, noise)

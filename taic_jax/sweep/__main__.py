@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from taic_jax import command_line
 from taic_jax.command_line import answer, attempt
 from taic_jax.config import ConfigError
-from taic_jax.sweep.axes import Axis, chunks, configs_of, grid, parse_axis, sample
+from taic_jax.sweep.axes import Axis, chunks, configs_of, grid, is_leaf, parse_axis, sample
 
-PROGRAM = "python -m taic_jax.sweep"
+PROGRAM, EXAMPLE = "python -m taic_jax.sweep", "train.ppo.learning_rate"
 
 
 @dataclass(frozen=True)
@@ -25,6 +25,10 @@ class Command(command_line.Command):
     """Random points to draw instead of the grid."""
     optuna: int = 0
     """Points that Optuna (extra sweep) asks for, a chunk at a time."""
+    pbt: int = 0
+    """Iterations of stage train after which, again and again, the worst points take over from the best (0: never)."""
+    cluster: str = ""
+    """HOST:PORT of a Ray cluster (extra cluster) whose nodes share this folder, or local; runs a chunk on each node."""
     memory: int = 0
     """MiB that a chunk of points may take; 0 takes half of what the machine has."""
     chunk: int = 0
@@ -39,6 +43,10 @@ def main(args: Sequence[str] | None = None) -> int:
 def execute(command: Command) -> int:
     """Sweep, or only print the plan; return the exit code."""
     axes = _check(command)
+    if command.cluster and not command.dry_run:
+        from taic_jax.sweep.cluster import connect
+
+        connect(command.cluster)
     if command.optuna:
         points = []
     else:
@@ -51,7 +59,11 @@ def execute(command: Command) -> int:
     keep_programs()
     # A sweep that is resumed keeps the chunks that it had: there is nothing to measure.
     size = command.chunk or (1 if command.resume else points_that_fit(command.config, command.memory))
-    plan = Plan(list(command.axes), command.samples, command.optuna, size, points, chunks(points, size))
+    plan = Plan(
+        list(command.axes), command.samples, command.optuna, size, points, chunks(points, size), pbt=command.pbt
+    )
+    if command.pbt and not command.resume and size < len(points):
+        raise ConfigError(f"--pbt: expected its {len(points)} points to run in one program, got at most {size} at once")
     if command.dry_run:
         print(plan.tell(command.config))
         return 0
@@ -59,7 +71,8 @@ def execute(command: Command) -> int:
     code = attempt(
         lambda signals: run_sweep(
             command.config, axes, plan, run_dir, resume=command.resume, overwrite=command.overwrite,
-            signals=signals, checkpoint_seconds=command.checkpoint_seconds,
+            on_cluster=bool(command.cluster), signals=signals, checkpoint_seconds=command.checkpoint_seconds,
+            shard=command.shard,
         ),
         run_dir,
     )  # fmt: skip
@@ -75,7 +88,7 @@ def _check(command: Command) -> list[Axis]:
       ConfigError: one is not valid, or stands twice, or there is none; or two strategies are asked for.
     """
     if not command.axes:
-        raise ConfigError("--axes: expected at least one FIELD=VALUES, such as train.ppo.learning_rate=1e-4,1e-3")
+        raise ConfigError(f"--axes: expected at least one FIELD=VALUES, such as {EXAMPLE}=1e-4,1e-3")
     axes = [parse_axis(text) for text in command.axes]
     names = [axis.name for axis in axes]
     for name in names:
@@ -83,10 +96,26 @@ def _check(command: Command) -> list[Axis]:
             raise ConfigError(f"--axes: {name} stands twice")
     if command.samples and command.optuna:
         raise ConfigError("--samples and --optuna: expected at most one of the two")
-    for name in ("samples", "optuna", "memory", "chunk"):
+    for name in ("samples", "optuna", "pbt", "memory", "chunk"):
         if getattr(command, name) < 0:
             raise ConfigError(f"--{name}: expected at least 0, got {getattr(command, name)}")
+    if command.pbt:
+        _check_population(command, names)
     return axes
+
+
+def _check_population(command: Command, names: list[str]) -> None:
+    """Check that points of these axes may take over each other's policies.
+
+    Raises:
+      ConfigError: they may not, or there is but one device's part of them.
+    """
+    for name in names:
+        if not (is_leaf(name) and name.startswith("train.")):
+            raise ConfigError(f"--pbt: {name}: expected numbers of stage train that one program can vary, as {EXAMPLE}")
+    if command.optuna or command.shard == "seeds":
+        other = "--optuna" if command.optuna else "--shard seeds"
+        raise ConfigError(f"--pbt and {other}: expected at most one of the two; points are compared in one program")
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ import random
 from collections.abc import Iterator, Sequence
 from typing import Any, get_type_hints
 
-from taic_jax.config import Config, ConfigError, walk
+from taic_jax.config import Config, ConfigError, replace, walk
 from taic_jax.config_io import closest, from_text
 from taic_jax.validation import validate
 
@@ -25,6 +25,11 @@ class Axis:
     low: float = 0.0
     high: float = 0.0
     logarithmic: bool = False
+
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """The least and the largest value of a number."""
+        return (self.low, self.high) if self.is_range else (min(self.values), max(self.values))
 
     @property
     def is_range(self) -> bool:
@@ -72,12 +77,6 @@ def parse_axis(text: str) -> Axis:
 def is_leaf(name: str) -> bool:
     """Return whether one program can run many values of this field."""
     return type(dict(walk(Config()))[name]) is float and not name.startswith(STATIC_FLOATS)
-
-
-def replace(config: Any, name: str, value: Any) -> Any:
-    """Replace the field of this dotted name."""
-    first, _, rest = name.partition(".")
-    return dataclasses.replace(config, **{first: replace(getattr(config, first), rest, value) if rest else value})
 
 
 def grid(axes: Sequence[Axis]) -> list[dict[str, Any]]:

@@ -6,21 +6,24 @@ import io
 import json
 import shutil
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from taic_jax.checkpoint import save_text
-from taic_jax.config import Config
+from taic_jax.config import Config, replace
 from taic_jax.config_io import to_yaml
 from taic_jax.experience import EXPERIENCE
 from taic_jax.interruption import DivergedError
+from taic_jax.logging import read_metrics
 from taic_jax.pipeline import run_pipeline
+from taic_jax.population import Population, schedule
 from taic_jax.run_folder import RunFolderError, claimed, prepare_folder
 from taic_jax.statistics import bootstrap_interval, iqm
-from taic_jax.sweep.axes import Axis, chunks, configs_of, replace, show
+from taic_jax.sweep.axes import Axis, chunks, configs_of, show
 from taic_jax.sweep.marginals import draw_marginals
 
 PLAN, TABLE, BEST, MARGINALS = "plan.json", "table.csv", "best.yaml", "marginals.png"
@@ -40,6 +43,7 @@ class Plan:
     points: list[dict[str, Any]]
     chunks: list[list[int]]
     trials: list[int] = dataclasses.field(default_factory=list)
+    pbt: int = 0
 
     def tell(self, config: Config) -> str:
         """Return the plan in a few lines."""
@@ -61,6 +65,7 @@ def run_sweep(
     *,
     resume: bool = False,
     overwrite: bool = False,
+    on_cluster: bool = False,
     **settings: Any,
 ) -> None:
     """Run what is missing, and write the table after every chunk, the best point and the marginal plots at the end.
@@ -70,6 +75,9 @@ def run_sweep(
       RunFolderError: the folder holds another sweep, or none to resume, or another process is at it.
     """
     config = replace(config, "evaluate.video_ticks", 0)
+    if plan.pbt:
+        bounds = {axis.name: axis.bounds for axis in axes}
+        settings["population"] = Population(plan.pbt, bounds, config.seeds)
     prepare_folder(config, run_dir, resume=resume, overwrite=overwrite)
     with claimed(run_dir):
         plan = _resumed(plan, run_dir) if resume else plan
@@ -78,19 +86,43 @@ def run_sweep(
             print(f"taic_jax: {run_dir} is finished: see {run_dir / TABLE}", file=sys.stderr)
             return
         table: list[dict[str, Any]] = []
-        for chunk in _chunks(config, axes, plan, run_dir, table):
-            table += run_chunk(config, plan, chunk, run_dir, settings)
-            _write_table(run_dir / TABLE, table)
+        run = _on_cluster if on_cluster else map
+        for batch in _batches(config, axes, plan, run_dir, table):
+            for rows in run(partial(run_chunk, config, plan, run_dir, settings), batch):
+                table += rows
+                _write_table(run_dir / TABLE, table)
         finished = [row for row in table if np.isfinite(row["iqm"])]
         if finished:
-            best = max(finished, key=lambda row: row["iqm"])
-            save_text(run_dir / BEST, to_yaml(configs_of(config, [plan.points[best["point"]]])[0]))
-            interval = f"{best['low']:.4g} … {best['high']:.4g}"
-            print(f"best: {show(plan.points[best['point']])}: {best['iqm']:.4g} ({interval})")
+            told = _best_member(config, plan, run_dir) if plan.pbt else _best_point(config, plan, finished)
+            save_text(run_dir / BEST, told)
         draw_marginals(run_dir / MARGINALS, axes, plan.points, {row["point"]: row["iqm"] for row in table})
 
 
-def run_chunk(config: Config, plan: Plan, chunk: int, run_dir: Path, settings: dict[str, Any]) -> list[dict[str, Any]]:
+def _best_point(config: Config, plan: Plan, table: list[dict[str, Any]]) -> str:
+    """Tell the point that did best, and return its config."""
+    best = max(table, key=lambda row: row["iqm"])
+    point = plan.points[best["point"]]
+    print(f"best: {show(point)}: {best['iqm']:.4g} ({best['low']:.4g} … {best['high']:.4g})")
+    return to_yaml(configs_of(config, [point])[0])
+
+
+def _best_member(config: Config, plan: Plan, run_dir: Path) -> str:
+    """Tell the member of all populations that did best, and return its last config behind its schedule."""
+    folder = run_dir / "chunk-000"
+    returns = np.array(
+        json.loads((folder / "summary.json").read_text())["methods"]["taic"]["return"]["per_seed"], float
+    )
+    best = int(np.nanargmax(returns))
+    rows = [row for row in read_metrics(folder / "metrics.jsonl") if row["stage"] == "train"]
+    found = schedule(rows, list(plan.points[0]), best)
+    print(f"best: {show(found[-1][1])} at the end: {returns[best]:.4g}, point {plan.chunks[0][best // config.seeds]}")
+    lines = [f"# from tick {tick}: {show(point)}\n" for tick, point in found]
+    return (
+        "# What --pbt found; below, the last of it.\n" + "".join(lines) + to_yaml(configs_of(config, [found[-1][1]])[0])
+    )
+
+
+def run_chunk(config: Config, plan: Plan, run_dir: Path, settings: dict[str, Any], chunk: int) -> list[dict[str, Any]]:
     """Run one chunk, unless it is done, and return a row per point."""
     folder, which = run_dir / f"chunk-{chunk:03d}", plan.chunks[chunk]
     points = configs_of(config, [plan.points[i] for i in which])
@@ -122,22 +154,37 @@ def _row(plan: Plan, i: int, config: Config, returns: np.ndarray, first: np.ndar
     }  # fmt: skip
 
 
-def _chunks(config: Config, axes: list[Axis], plan: Plan, run_dir: Path, table: list[dict[str, Any]]) -> Iterator[int]:
-    """Yield the chunks to run, in order; where Optuna asks, tell it of each and let it ask for the next."""
+def _on_cluster(work: partial, batch: Sequence[int]) -> Iterator[list[dict[str, Any]]]:
+    """Run the chunks of a batch as tasks of the cluster that this process is connected to."""
+    from taic_jax.sweep.cluster import run_tasks
+
+    config, plan, run_dir, settings = work.args
+    settings = dict(settings)
+    signals = settings.pop("signals", None)  # they are this process's
+    work = partial(run_chunk, config, plan, run_dir.absolute(), settings)
+    return run_tasks(work, [(chunk,) for chunk in batch], signals)
+
+
+def _batches(
+    config: Config, axes: list[Axis], plan: Plan, run_dir: Path, table: list[dict[str, Any]]
+) -> Iterator[Sequence[int]]:
+    """Yield the chunks to run; where Optuna asks, those it asked for, and tell it of them before it asks for the next.
+
+    Chunks of one batch may run in any order, or at once.
+    """
     if not plan.optuna:
-        yield from range(len(plan.chunks))
+        yield range(len(plan.chunks))
         return
     from taic_jax.sweep.asking import Study
 
     study, told = Study(axes, run_dir, config.seed), 0
     chunk = 0
     while True:
-        while chunk < len(plan.chunks):
-            yield chunk
-            chunk += 1
-            for row in table[told:]:
-                study.tell(plan.trials[row["point"]], row["iqm"])
-            told = len(table)
+        yield range(chunk, len(plan.chunks))
+        chunk = len(plan.chunks)
+        for row in table[told:]:
+            study.tell(plan.trials[row["point"]], row["iqm"])
+        told = len(table)
         wanted = min(plan.size, plan.optuna - len(plan.points))
         if wanted <= 0:
             return
@@ -160,7 +207,7 @@ def _resumed(plan: Plan, run_dir: Path) -> Plan:
         saved = Plan(**json.loads((run_dir / PLAN).read_text()))
     except (OSError, ValueError, TypeError):
         raise RunFolderError(f"{run_dir} holds no sweep to resume: no {PLAN} in it") from None
-    for name in ("axes", "samples", "optuna"):
+    for name in ("axes", "samples", "optuna", "pbt"):
         if getattr(saved, name) != getattr(plan, name):
             raise RunFolderError(
                 f"{run_dir} was run with other points: --{name} was {getattr(saved, name)}, got {getattr(plan, name)}"
