@@ -44,8 +44,9 @@ class Command:
     """Print the configuration and the plan, and stop."""
     checkpoint_seconds: float = 30.0
     """Least seconds between two checkpoints of a stage; 0 makes one every iteration."""
-    shard: Shard = "none"
-    """Split over all devices that JAX sees: the seeds (of all points), or the environments of each seed."""
+    shard: Shard = "auto"
+    """Split over devices (accelerators, or the cores of a CPU): the seeds of all points, or the environments of each
+    seed; auto splits the seeds where there are several."""
     options: Annotated[str, tyro.conf.arg(metavar="RUN")] = ""
     """Run or artifact whose option model is used as it is; short for --options.source."""
     config: Annotated[Config, tyro.conf.arg(name=""), tyro.conf.FlagConversionOff] = Config()

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Literal
 
-Shard = Literal["none", "seeds", "envs"]
+Shard = Literal["auto", "none", "seeds", "envs"]
 """What is split over devices; no part of an experiment, but known here without JAX."""
 
 

@@ -1,5 +1,6 @@
 """Many devices: the rows of a program (the seeds of all points), or its environments, over all that JAX sees."""
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,6 +12,7 @@ from jax.sharding import AxisType, Mesh, NamedSharding
 from jax.sharding import PartitionSpec as Spec
 
 from taic_jax.config import Config, ConfigError, Shard
+from taic_jax.envs.physics.mujoco import num_physical_cores
 
 Tree = TypeVar("Tree")
 
@@ -59,6 +61,20 @@ class Devices:
     def _fill(self, x: Any) -> Any:
         missing = -len(x) % self.mesh.size
         return x[np.minimum(np.arange(len(x) + missing), len(x) - 1)] if missing else x
+
+
+def open_devices(shard: Shard, rows: int) -> Shard:
+    """Have JAX take each physical core of a CPU for a device, no more than there are rows; return what to split.
+
+    To be called before anything is computed. A number of devices that JAX was told is kept.
+    """
+    told = "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
+    if shard != "none" and not told and jax.config.values["jax_num_cpu_devices"] < 1:
+        cores = num_physical_cores()
+        jax.config.update("jax_num_cpu_devices", cores if shard == ENVS else min(cores, rows))
+    if shard == "auto":
+        return SEEDS if min(rows, jax.device_count()) > 1 else "none"
+    return shard
 
 
 def make_devices(shard: Shard, config: Config) -> Devices:

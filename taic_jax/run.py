@@ -46,6 +46,7 @@ def execute(command: Command) -> int:
         print(found or f"{command.replay}: all numbers were finite this time")
         return 0 if found else FAILED
     from taic_jax.compilation import keep_programs
+    from taic_jax.devices import open_devices
     from taic_jax.pipeline import make_envs, run_pipeline
     from taic_jax.summary import plan
 
@@ -54,11 +55,12 @@ def execute(command: Command) -> int:
         print(plan(command.config, *make_envs(command.config)))
         return 0
     keep_programs()
+    shard = open_devices(command.shard, command.config.seeds)
     run_dir = command.folder
     code = attempt(
         lambda signals: run_pipeline(
             command.config, run_dir, resume=command.resume, overwrite=command.overwrite,
-            signals=signals, checkpoint_seconds=command.checkpoint_seconds, shard=command.shard,
+            signals=signals, checkpoint_seconds=command.checkpoint_seconds, shard=shard,
         ),
         run_dir,
     )  # fmt: skip

@@ -1,5 +1,8 @@
 """Two devices do what one does: over seeds, environments, with MuJoCo's callback, resumed on another number."""
 
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import jax
@@ -12,6 +15,7 @@ from taic_jax.checkpoint import Checkpoints
 from taic_jax.config_io import to_yaml
 from taic_jax.devices import Devices, over_envs, take
 from taic_jax.envs import PhysicsState, make_env
+from taic_jax.envs.physics.mujoco import num_physical_cores
 from taic_jax.run import main
 
 SLOPE = """
@@ -38,7 +42,7 @@ def tiny():
 def one(tmp_path_factory):
     """Run three seeds on one device."""
     with pytest.MonkeyPatch.context() as patch:
-        return run_in(tmp_path_factory.mktemp("one"), patch, "--seeds", "3")
+        return run_in(tmp_path_factory.mktemp("one"), patch, "--seeds", "3", "--shard", "none")
 
 
 def run_in(folder: Path, patch: pytest.MonkeyPatch, *args: str) -> Path:
@@ -71,7 +75,7 @@ def test_seeds_over_two_devices_do_as_on_one_and_go_on_there(one, tmp_path, monk
     with monkeypatch.context() as patch, pytest.raises(KilledError):  # in stage train
         die(patch, Checkpoints, "save", 3 + 2 + 2)
         run_in(tmp_path, monkeypatch, "--seeds", "3", "--shard", "seeds")  # so that one row is padding
-    assert main(["--resume", "--run-dir", "run", "--checkpoint-seconds", "0"]) == 0
+    assert main(["--resume", "--run-dir", "run", "--checkpoint-seconds", "0", "--shard", "none"]) == 0
     assert_same_run(one, tmp_path / "run", ("collect", "learn", "train"))
     for path in (one / "experience").glob("*.npz"):
         assert np.load(path)["obs"].shape == np.load(tmp_path / "run/experience" / path.name)["obs"].shape
@@ -82,7 +86,7 @@ def test_environments_over_two_devices_do_as_on_one_and_go_on_there(one, tmp_pat
     with monkeypatch.context() as patch, pytest.raises(KilledError):
         die(patch, Checkpoints, "save", 2)
         run_in(tmp_path, monkeypatch, *args, "envs")
-    assert main(["--resume", "--run-dir", "run", "--checkpoint-seconds", "0"]) == 0
+    assert main(["--resume", "--run-dir", "run", "--checkpoint-seconds", "0", "--shard", "none"]) == 0
     assert_same_run(one, tmp_path / "run", ("train",))
 
 
@@ -116,3 +120,16 @@ def test_each_device_calls_the_engine_with_its_part(shard, monkeypatch):
     jax.tree.map(np.testing.assert_array_equal, *results)
     whole, parts = sizes[:3], sizes[3:]
     assert len(parts) == 6 and sum(parts) == sum(whole) and set(parts) == {whole[0] // 2}
+
+
+def test_cores_of_a_cpu_become_devices_no_more_than_rows():
+    program = "import sys; from taic_jax.devices import open_devices; import jax; "
+    program += "print(*[open_devices(sys.argv[1], int(sys.argv[2])), jax.device_count()])"
+    env = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
+    told = {}
+    for shard, rows in (("auto", 1), ("auto", 2), ("none", 9), ("seeds", 1)):
+        line = [sys.executable, "-W", "ignore", "-c", program, shard, str(rows)]
+        told[shard, rows] = subprocess.run(line, env=env, check=True, capture_output=True, text=True).stdout.split()
+    two = min(2, num_physical_cores())
+    assert told["auto", 1] == ["none", "1"] and told["none", 9] == ["none", "1"] and told["seeds", 1] == ["seeds", "1"]
+    assert told["auto", 2] == ["seeds" if two == 2 else "none", str(two)]

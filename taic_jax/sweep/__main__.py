@@ -53,10 +53,13 @@ def execute(command: Command) -> int:
         points = sample(axes, command.samples, command.config.seed) if command.samples else grid(axes)
         configs_of(command.config, points)
     from taic_jax.compilation import keep_programs
+    from taic_jax.devices import open_devices
     from taic_jax.sweep.memory import points_that_fit
     from taic_jax.sweep.runs import TABLE, Plan, run_sweep
 
     keep_programs()
+    asked = "none" if command.pbt and command.shard == "auto" else command.shard
+    shard = open_devices(asked, command.config.seeds * (len(points) or command.optuna))
     # A sweep that is resumed keeps the chunks that it had: there is nothing to measure.
     size = command.chunk or (1 if command.resume else points_that_fit(command.config, command.memory))
     plan = Plan(
@@ -72,7 +75,7 @@ def execute(command: Command) -> int:
         lambda signals: run_sweep(
             command.config, axes, plan, run_dir, resume=command.resume, overwrite=command.overwrite,
             on_cluster=bool(command.cluster), signals=signals, checkpoint_seconds=command.checkpoint_seconds,
-            shard=command.shard,
+            shard=shard,
         ),
         run_dir,
     )  # fmt: skip
