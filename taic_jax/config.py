@@ -68,6 +68,8 @@ class PPOConfig:
     """Global norm at which gradients are clipped."""
     log_std_init: float = -0.916
     """Initial log standard deviation of the policy; exp(-0.916) = 0.4."""
+    reset_at_change: bool = False
+    """Set it back to its initial value where the task changes, once half of the environments have (env.change_after)."""
     normalize_advantage: bool = True
     """Standardise the advantages of each minibatch."""
     normalize_reward: bool = True
