@@ -12,6 +12,7 @@ import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +21,7 @@ import tyro
 from taic_jax.checkpoint import save_text
 from taic_jax.config import ConfigError
 from taic_jax.experiments.cells import Cell, all_cells
+from taic_jax.experiments.spaces import measure_spaces
 from taic_jax.experiments.table import TABLE, TableError, append_row, read_table, row_of
 from taic_jax.logging import RunLogger
 from taic_jax.pipeline import collect, make_envs, run_pipeline, train_baseline
@@ -87,6 +89,14 @@ def do(cell: Cell, run_dir: Path) -> None:
         run_pipeline(cell.config, folder, resume=begun)
 
 
+def make_row(cell: Cell, run_dir: Path, method: str, stage: str) -> dict[str, Any]:
+    """Return the row of one method of a finished run; of options on a robot with the measures of their spaces."""
+    row = row_of(run_dir / cell.name, run_dir, method, stage)
+    if cell.figure in ("6", "7") and stage == "train":
+        row["numbers"] |= measure_spaces(run_dir / cell.name)
+    return row
+
+
 def run_flat(cell: Cell, folder: Path, stage: str, resume: bool) -> None:
     """Train flat PPO alone: `collect`, which keeps its experience, or a baseline."""
     config = cell.config
@@ -116,7 +126,7 @@ def main(args: Sequence[str] | None = None) -> None:
             do(cell, arguments.run_dir)
             for method, stage in cell.stages.items():
                 if (cell.config.env.name, method, cell.config.seed) not in known:
-                    append_row(arguments.table, row_of(arguments.run_dir / cell.name, arguments.run_dir, method, stage))
+                    append_row(arguments.table, make_row(cell, arguments.run_dir, method, stage))
     except (ConfigError, RunFolderError, TableError) as error:
         print(f"evidence: {error}", file=sys.stderr)
         raise SystemExit(2) from None

@@ -69,7 +69,7 @@ class PPOConfig:
     log_std_init: float = -0.916
     """Initial log standard deviation of the policy; exp(-0.916) = 0.4."""
     reset_at_change: bool = False
-    """Set it back to its initial value where the task changes, once half of the environments have (env.change_after)."""
+    """Set it back to that where the task changes (env.change_after), once half of the environments have."""
     normalize_advantage: bool = True
     """Standardise the advantages of each minibatch."""
     normalize_reward: bool = True

@@ -7,7 +7,13 @@ import pytest
 from scipy import stats
 
 from taic_jax.statistics import (
-    bootstrap_interval, exact_interval, holm, iqm, probability_of_improvement, stratified_interval, summarize,
+    bootstrap_interval,
+    exact_interval,
+    holm,
+    iqm,
+    probability_of_improvement,
+    stratified_interval,
+    summarize,
 )  # fmt: skip
 
 

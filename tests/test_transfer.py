@@ -22,7 +22,7 @@ from tiny_runs import (
 
 from taic_jax import guard, pipeline
 from taic_jax.checkpoint import Checkpoints
-from taic_jax.config import Config, collector_is_baseline, needs_collect
+from taic_jax.config import Config, ConfigError, collector_is_baseline, needs_collect
 from taic_jax.pipeline import make_envs, run_pipeline
 from taic_jax.stage import STAGES
 from taic_jax.summary import plan
