@@ -13,6 +13,8 @@ RECOVERY = "nav2d"
 TICKS = {"ant": 2_000_000} | dict.fromkeys(TRANSFERS, 3_000_000)
 MILLION = 1_000_000
 FIRST_SEED = 200
+PATHS = "paths"
+"""Method of the row that holds what options of the room draw."""
 RULES, DECODERS = ("fixed", "output", "predict"), ("open", "closed")
 
 # Found by `experiments.option_search`, whose log is results/option_search.csv.
@@ -133,7 +135,9 @@ def transfers(task: str, run_dir: Path, seeds: int = 10) -> list[Cell]:
 def recovery(run_dir: Path, seeds: int = 50) -> list[Cell]:
     """Return the runs of figure 5: options of the room, and recovery after it changes."""
     source = dataclasses.replace(load_config("nav2d"), seed=FIRST_SEED, seeds=seeds)
-    source = dataclasses.replace(source, train=dataclasses.replace(source.train, baselines=()))
+    ppo = source.train.ppo  # nothing needs its policy over options: one iteration
+    train = dataclasses.replace(source.train, baselines=(), ticks=ppo.num_envs * ppo.rollout_length)
+    source = dataclasses.replace(source, train=train)
     config = load_config("nav2d_change")
     experience = (str(run_dir / "nav2d/source"),)
     config = dataclasses.replace(
@@ -143,7 +147,7 @@ def recovery(run_dir: Path, seeds: int = 50) -> list[Cell]:
         seeds=seeds,
     )
     stages = {method: stage for method, (_, stage) in RECOVERING.items()}
-    return [Cell("nav2d/source", source, {}, "5"), Cell("nav2d/change", config, stages, "5")]
+    return [Cell("nav2d/source", source, {PATHS: "options"}, "5"), Cell("nav2d/change", config, stages, "5")]
 
 
 def all_cells(run_dir: Path) -> list[Cell]:

@@ -20,7 +20,8 @@ import tyro
 
 from taic_jax.checkpoint import save_text
 from taic_jax.config import ConfigError
-from taic_jax.experiments.cells import Cell, all_cells
+from taic_jax.experiments.cells import PATHS, Cell, all_cells
+from taic_jax.experiments.option_paths import paths_of
 from taic_jax.experiments.spaces import measure_spaces
 from taic_jax.experiments.table import TABLE, TableError, append_row, read_table, row_of
 from taic_jax.logging import RunLogger
@@ -91,10 +92,18 @@ def do(cell: Cell, run_dir: Path) -> None:
 
 def make_row(cell: Cell, run_dir: Path, method: str, stage: str) -> dict[str, Any]:
     """Return the row of one method of a finished run; of options on a robot with the measures of their spaces."""
+    if method == PATHS:
+        return paths_row(run_dir / cell.name, run_dir)
     row = row_of(run_dir / cell.name, run_dir, method, stage)
     if cell.figure in ("6", "7") and stage == "train":
         row["numbers"] |= measure_spaces(run_dir / cell.name)
     return row
+
+
+def paths_row(folder: Path, run_dir: Path) -> dict[str, Any]:
+    """Return the row of what the options of a finished run draw."""
+    row = row_of(folder, run_dir, PATHS, "train") | {"curves": {}, "grid": [], "ticks": 0}
+    return row | paths_of(folder)
 
 
 def run_flat(cell: Cell, folder: Path, stage: str, resume: bool) -> None:

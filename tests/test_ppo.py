@@ -224,7 +224,7 @@ def test_vmapped_runs_are_the_runs_alone(learning_rates, seeds):
 @pytest.mark.parametrize("reset", [True, False])
 def test_exploration_is_reset_once_where_the_task_changes(reset):
     """Episodes of six ticks, the first in the room as it was: the task changes within the first of the rollouts."""
-    config = dataclasses.replace(ONE_STEP, num_envs=2, rollout_length=8, log_std_init=0.5, reset_at_change=reset)
+    config = dataclasses.replace(ONE_STEP, num_envs=2, rollout_length=8, log_std_reset=0.5, reset_at_change=reset)
     env, executor = TimeLimit(Navigation(change_after=1), 6), IdentityExecutor(2)
     config = as_arrays(dataclasses.replace(config, minibatch_size=16, learning_rate=0.0))
     state, narrow, found = ppo.init(config, env, executor, jax.random.key(0)), jnp.full(2, -1.0), []

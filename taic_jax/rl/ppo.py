@@ -168,7 +168,7 @@ def _explore_anew(
     if "changed" not in after:
         return params
     half = (jnp.mean(before["changed"]) < 0.5) & (jnp.mean(after["changed"]) >= 0.5)
-    return params.replace(log_std=jnp.where(half, config.log_std_init, params.log_std))
+    return params.replace(log_std=jnp.where(half, config.log_std_reset, params.log_std))
 
 
 def _metrics(config: PPOConfig, state: TrainState, ticks: Rollout, result: Update, length: int) -> dict[str, Array]:
