@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import tyro
 
 from taic_jax.checkpoint import save_text
+from taic_jax.compilation import keep_programs
 from taic_jax.config import ConfigError
 from taic_jax.experiments.cells import PATHS, Cell, all_cells
 from taic_jax.experiments.option_paths import paths_of
@@ -130,6 +131,7 @@ def main(args: Sequence[str] | None = None) -> None:
         if arguments.list:
             show(cells, planned, known, arguments)
             return
+        keep_programs()
         for cell in planned:
             print(f"{cell.name}: {cell.config.seeds} seeds from {cell.config.seed}", flush=True)
             do(cell, arguments.run_dir)

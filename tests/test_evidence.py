@@ -130,7 +130,7 @@ def test_runs_are_done_once_and_taken_in_as_rows(monkeypatch, tmp_path, table, c
     cells = [Cell("flat", flat, {"strong": "collect"}, "7"), Cell("options", options, {"options": "train"}, "5")]
     monkeypatch.setattr(evidence, "all_cells", lambda run_dir: cells)
     arguments = ["--run-dir", str(tmp_path), "--table", str(table)]
-    with tiny_steps(tmp_path / "compiled"):
+    with tiny_steps():
         evidence.main([*arguments, "--only", "flat"])
         run_pipeline(options, tmp_path / "options")  # by another call of another program
         monkeypatch.setattr(evidence, "run_pipeline", lambda *_, **__: pytest.fail("it is finished"))

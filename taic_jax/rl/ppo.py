@@ -139,11 +139,8 @@ def iterate(
     progress = state.iteration.astype(jnp.float32) / num_iterations if config.learning_rate_decay else 0.0
     learning_rate = config.learning_rate * (1.0 - progress)
     result = update(policy, config, learning_rate, state.params, state.optimizer, decisions, decision, key_update)
-    params = result.params
-    if config.reset_at_change:
-        params = _explore_anew(config, params, state.running.env.metrics, running.env.metrics)
     state = state.replace(
-        params=params,
+        params=_explore_anew(config, result.params, state.running.env.metrics, running.env.metrics),
         optimizer=result.optimizer,
         obs_statistics=normalize.update(state.obs_statistics, ticks.obs),
         reward_scale=reward_scale,
@@ -165,7 +162,7 @@ def _explore_anew(
 
     A task that tells no metric `changed` never changes.
     """
-    if "changed" not in after:
+    if not config.reset_at_change or "changed" not in after:
         return params
     half = (jnp.mean(before["changed"]) < 0.5) & (jnp.mean(after["changed"]) >= 0.5)
     return params.replace(log_std=jnp.where(half, config.log_std_reset, params.log_std))
