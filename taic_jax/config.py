@@ -71,6 +71,10 @@ class PPOConfig:
     """Global norm at which gradients are clipped."""
     log_std_init: float = -0.916
     """Initial log standard deviation of the policy; exp(-0.916) = 0.4."""
+    reset_at_change: bool = False
+    """Set it to log_std_reset where the task changes (env.change_after), once half of the environments have."""
+    log_std_reset: float = 0.0
+    """Log standard deviation from which exploration starts anew there."""
     normalize_advantage: bool = True
     """Standardise the advantages of each minibatch."""
     normalize_reward: bool = True

@@ -111,6 +111,11 @@ def make_envs(config: Config) -> tuple[Env, Env]:
             f"collect.env: expected the body of {config.env.name} (proprioceptive slice, its size, and action size "
             f"{bodies[1]}), got {config.collect.env} with {bodies[0]}"
         )
+    if config.train.ppo.reset_at_change and "changed" not in jax.eval_shape(env.reset, jax.random.key(0)).metrics:
+        raise ConfigError(
+            f"train.ppo.reset_at_change: expected a task that changes, as nav2d does with env.change_after, "
+            f"got {config.env.name}, which never does; the nearest valid value is False"
+        )
     if config.options.length > env.episode_length:
         raise ConfigError(
             f"options.length: expected at most the {env.episode_length} ticks of an episode of {env.name}, "

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from taic_jax.checkpoint import PARTIAL, save_text
-from taic_jax.config import COLLECT, Config
-from taic_jax.config_io import to_yaml
+from taic_jax.config import COLLECT, Config, walk
+from taic_jax.config_io import load_config, to_yaml
 
 try:
     import fcntl
@@ -33,9 +33,9 @@ def prepare_folder(config: Config, run_dir: Path, *, resume: bool = False, overw
     if resume:
         if not saved.is_file():
             raise RunFolderError(f"{run_dir} holds no run to resume: no config.yaml in it")
-        old = saved.read_text().splitlines()
-        differing = [line.strip() for line in text.splitlines() if line not in old]
-        if differing or len(old) != len(text.splitlines()):
+        old = dict(walk(load_config(str(saved))))  # a field that is newer than the run has its default there
+        differing = [f"{name}: {value}" for name, value in walk(config) if old[name] != value]
+        if differing:
             raise RunFolderError(f"{run_dir} was run with another config, differing in {differing[:1]}")
         return
     if run_dir.exists() and (not run_dir.is_dir() or _holds_files(run_dir)):

@@ -1,5 +1,6 @@
-"""Statistics over seeds: interquartile mean and bootstrap interval (Agarwal et al., 2021)."""
+"""Statistics over seeds: interquartile mean, bootstrap intervals (Agarwal et al., 2021), shares and many tests."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -53,6 +54,40 @@ def probability_of_improvement(x: ArrayLike, y: ArrayLike, seed: int = 0) -> tup
     means = [wins[np.ix_(i, j)].mean() for i, j in zip(rows, columns, strict=True)]
     low, high = np.quantile(means, [0.025, 0.975])
     return float(wins.mean()), (float(low), float(high))
+
+
+def stratified_interval(
+    groups: Sequence[ArrayLike], seed: int = 0, confidence: float = 0.95
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the percentile bootstrap interval of the interquartile mean over all groups, each resampled by itself.
+
+    Args:
+        groups: [K, ...] each, one row per seed; a group is a task, or what else must not lend seeds to another.
+        seed: of the resampling.
+        confidence: probability mass of the interval.
+    """
+    groups, random = [np.asarray(group, np.float64) for group in groups], np.random.default_rng(seed)
+    draws = []
+    for _ in range(BOOTSTRAP_DRAWS):
+        rows = np.concatenate([group[random.integers(len(group), size=len(group))] for group in groups])
+        draws.append(iqm(rows, axis=0))
+    tail = (1 - confidence) / 2
+    low, high = np.quantile(draws, [tail, 1 - tail], axis=0)
+    return low, high
+
+
+def exact_interval(count: int, total: int, confidence: float = 0.95) -> tuple[float, float]:
+    """Return the interval of a share, `count` of `total`, of Clopper & Pearson (1934): it never covers too little."""
+    interval = stats.binomtest(count, total).proportion_ci(confidence, method="exact")
+    return float(interval.low), float(interval.high)
+
+
+def holm(p_values: ArrayLike) -> np.ndarray:
+    """Return p-values [H] of as many hypotheses, adjusted so that any false rejection is rare (Holm, 1979)."""
+    p = np.asarray(p_values, np.float64)
+    order = np.argsort(p)
+    adjusted = np.maximum.accumulate(p[order] * np.arange(len(p), 0, -1))
+    return np.minimum(adjusted, 1.0)[np.argsort(order)]
 
 
 def summarize(per_seed: ArrayLike) -> dict[str, Any]:

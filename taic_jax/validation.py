@@ -23,6 +23,7 @@ BOUNDS: dict[str, tuple[float, float]] = {
     "gamma": (0, 1),
     "lambda_": (0, 1),
     "log_std_init": (-20, 2),
+    "log_std_reset": (-20, 2),
     "max_grad_norm": (TINY, math.inf),
 }
 MAY_BE_EMPTY = ("options.experience", "train.baselines")

@@ -14,6 +14,7 @@ from scipy import stats
 
 from taic_jax import normalize
 from taic_jax.config import PPOConfig
+from taic_jax.envs import Navigation, TimeLimit
 from taic_jax.networks import Policy, PolicyParams
 from taic_jax.options.execution import IdentityExecutor
 from taic_jax.returns import semi_markov_advantages
@@ -218,3 +219,18 @@ def test_vmapped_runs_are_the_runs_alone(learning_rates, seeds):
         assert_trees_equal(jax.tree.map(lambda x, k=k: x[k], together), alone[k], rtol=1e-4, atol=1e-5)
     assert (alone[0][0].params.log_std != alone[1][0].params.log_std).all()
     assert train_alone._cache_size() == train_together._cache_size() == 1
+
+
+@pytest.mark.parametrize("reset", [True, False])
+def test_exploration_is_reset_once_where_the_task_changes(reset):
+    """Episodes of six ticks, the first in the room as it was: the task changes within the first of the rollouts."""
+    config = dataclasses.replace(ONE_STEP, num_envs=2, rollout_length=8, log_std_reset=0.5, reset_at_change=reset)
+    env, executor = TimeLimit(Navigation(change_after=1), 6), IdentityExecutor(2)
+    config = as_arrays(dataclasses.replace(config, minibatch_size=16, learning_rate=0.0))
+    state, narrow, found = ppo.init(config, env, executor, jax.random.key(0)), jnp.full(2, -1.0), []
+    iterate = jax.jit(partial(ppo.iterate, config, env, executor, ITERATIONS))
+    for _ in range(2):
+        state, metrics, _ = iterate(state.replace(params=state.params.replace(log_std=narrow)))
+        found.append(state.params.log_std.tolist())
+    assert found == [[0.5, 0.5] if reset else [-1.0, -1.0], [-1.0, -1.0]]
+    assert metrics["episodes"] == 2.0, "of 16 ticks, two environments end their second episodes in the second rollout"

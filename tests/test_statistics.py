@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from taic_jax.statistics import bootstrap_interval, iqm, probability_of_improvement, summarize
+from taic_jax.statistics import (
+    bootstrap_interval,
+    exact_interval,
+    holm,
+    iqm,
+    probability_of_improvement,
+    stratified_interval,
+    summarize,
+)  # fmt: skip
 
 
 def test_iqm_drops_the_lowest_and_highest_quarter():
@@ -71,3 +79,25 @@ def test_probability_of_improvement_by_hand():
     assert share == pytest.approx((1 + 3 + 2 + 0.5) / 9) and low < share < high
     assert probability_of_improvement([2, 3], [0, 1]) == (1.0, (1.0, 1.0))
     assert probability_of_improvement([1, 1], [1, 1])[0] == 0.5
+
+
+def test_a_stratified_interval_never_mixes_groups():
+    """Two groups of equal values each: however they are resampled, the middle half is the same."""
+    low, high = stratified_interval([np.zeros((4, 3)), np.ones((4, 3))])
+    np.testing.assert_array_equal([low, high], np.full((2, 3), 0.5))
+    values = np.arange(12.0)[:, None]
+    mixed = stratified_interval([values])
+    assert mixed[0] < iqm(values, axis=0) < mixed[1]
+    apart = stratified_interval([values[:6], values[6:]])
+    assert apart[1] - apart[0] < mixed[1] - mixed[0]
+
+
+def test_exact_intervals_are_those_of_the_tables():
+    # 2 of 10: the roots of the binomial tails at 0.025; 10 of 10: 0.025 ** (1 / 10).
+    np.testing.assert_allclose(exact_interval(2, 10), (0.02521, 0.55610), atol=1e-5)
+    np.testing.assert_allclose(exact_interval(10, 10), (0.025**0.1, 1.0))
+
+
+def test_holm_by_hand():
+    np.testing.assert_allclose(holm([0.04, 0.01, 0.03]), [0.06, 0.03, 0.06])
+    np.testing.assert_allclose(holm([0.6, 0.5]), [1.0, 1.0])

@@ -22,7 +22,7 @@ from tiny_runs import (
 
 from taic_jax import guard, pipeline
 from taic_jax.checkpoint import Checkpoints
-from taic_jax.config import Config, collector_is_baseline, needs_collect
+from taic_jax.config import Config, ConfigError, collector_is_baseline, needs_collect
 from taic_jax.pipeline import make_envs, run_pipeline
 from taic_jax.stage import STAGES
 from taic_jax.summary import plan
@@ -204,3 +204,10 @@ def test_the_plan_says_what_will_run(fields, expected):
     assert len(lines) == len(expected)
     for line, start in zip(lines, expected, strict=True):
         assert line.startswith(start)
+
+
+def test_a_reset_at_a_change_that_never_comes_is_refused():
+    config = with_fields(CONFIG, train__ppo__reset_at_change=True)
+    with pytest.raises(ConfigError, match=r"train\.ppo\.reset_at_change: expected a task that changes.*got nav2d"):
+        make_envs(config)
+    make_envs(with_fields(config, env__change_after=3))

@@ -140,7 +140,7 @@ def iterate(
     learning_rate = config.learning_rate * (1.0 - progress)
     result = update(policy, config, learning_rate, state.params, state.optimizer, decisions, decision, key_update)
     state = state.replace(
-        params=result.params,
+        params=_explore_anew(config, result.params, state.running.env.metrics, running.env.metrics),
         optimizer=result.optimizer,
         obs_statistics=normalize.update(state.obs_statistics, ticks.obs),
         reward_scale=reward_scale,
@@ -155,6 +155,19 @@ def iterate(
     return state, _metrics(config, state, ticks, result, executor.length) | {"nonfinite": nonfinite}, ticks
 
 
+def _explore_anew(
+    config: PPOConfig, params: PolicyParams, before: dict[str, Array], after: dict[str, Array]
+) -> PolicyParams:
+    """Reset the standard deviation where half of the environments have changed after a rollout, and had not before it.
+
+    A task that tells no metric `changed` never changes.
+    """
+    if not config.reset_at_change or "changed" not in after:
+        return params
+    half = (jnp.mean(before["changed"]) < 0.5) & (jnp.mean(after["changed"]) >= 0.5)
+    return params.replace(log_std=jnp.where(half, config.log_std_reset, params.log_std))
+
+
 def _metrics(config: PPOConfig, state: TrainState, ticks: Rollout, result: Update, length: int) -> dict[str, Array]:
     """Return the scalars of one iteration and, where options take more than one tick, their durations [L]."""
     count = jnp.sum(ticks.decision, dtype=jnp.int32)
@@ -163,6 +176,7 @@ def _metrics(config: PPOConfig, state: TrainState, ticks: Rollout, result: Updat
     return {
         # Of each environment's last finished episode; NaN until one has finished.
         "return": jnp.nanmean(state.running.last_return),
+        "episodes": jnp.sum(ticks.terminated | ticks.truncated, dtype=jnp.int32).astype(jnp.float32),
         "decisions": count.astype(jnp.float32),
         "duration": ticks.decision.size / count.astype(jnp.float32),
         "std": jnp.mean(jnp.exp(state.params.log_std)),

@@ -1,0 +1,160 @@
+"""The runs that the paper's figures need, each a folder with a config and the methods that it gives rows of."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from taic_jax.config import CollectConfig, Config, EvaluateConfig, OptionsConfig
+from taic_jax.config_io import load_config
+
+ROBOTS = ("half_cheetah", "ant", "hopper", "walker2d")
+TRANSFERS = ("ant_turn", "ant_maze", "ant_push", "ant_fall")
+RECOVERY = "nav2d"
+TICKS = {"ant": 2_000_000} | dict.fromkeys(TRANSFERS, 3_000_000)
+MILLION = 1_000_000
+FIRST_SEED = 200
+PATHS = "paths"
+"""Method of the row that holds what options of the room draw."""
+RULES, DECODERS = ("fixed", "output", "predict"), ("open", "closed")
+
+# Found by `experiments.option_search`, whose log is results/option_search.csv.
+VARIABLE = {"length": 10}
+# In closed loop D follows whatever gait it saw, so the best windows of the whole run serve; in open loop they do not.
+SETTINGS: dict[str, dict[str, float]] = {
+    "open": {"since": 0.2, "until": 0.5, "lambda_kl": 0.01, "lambda_pred": 1.0, "lambda_adv": 0.1},
+    "closed": {"since": 0.0, "until": 1.0, "lambda_kl": 0.001, "lambda_pred": 0.3, "lambda_adv": 0.03},
+}
+CONSTRAINTS: dict[str, dict[str, float]] = {
+    "both": {},
+    "none": {"lambda_pred": 0.0, "lambda_adv": 0.0},
+    "pred": {"lambda_adv": 0.0},
+    "adv": {"lambda_pred": 0.0},
+}
+
+# Method: label and fewest seeds of figure 7. An option method's name is its termination, decoder and constraints.
+METHODS = {
+    "strong": ("flat PPO", 20),
+    "weak": ("flat PPO, paper-like", 10),
+    "repeat": ("flat PPO, action repeat", 5),
+    "fixed-open-none": ("RVAE only", 10),
+    "fixed-open-both": ("Fix-len", 10),
+    "output-open-both": ("Term-output", 10),
+    "predict-open-both": ("Term-predict", 10),
+    "fixed-closed-both": ("Fix-len, closed loop", 20),
+}
+# Beside them, on HalfCheetah: every other kind of options, for the table of rules and for figure 6.
+OTHERS = {
+    f"{rule}-{decoder}-{constraints}": ("", 10)
+    for decoder in DECODERS
+    for constraints in ("both", "none")
+    for rule in RULES
+    if f"{rule}-{decoder}-{constraints}" not in METHODS
+}
+# Of figure 8: the method's name, and of figure 5c: the stage of the run that trains it.
+TRANSFERRED = {"options": ("options of Ant", "train"), "flat": ("flat PPO", "flat"),
+               "transfer": ("flat PPO from Ant's policy", "transfer")}  # fmt: skip
+RECOVERING = {"options": ("options", "train"), "flat": ("flat PPO", "flat")}
+
+
+class Cell(NamedTuple):
+    """A run to be done: its folder's name, its config, and the stage that trains each method it gives a row of."""
+
+    name: str
+    config: Config
+    stages: dict[str, str]
+    figure: str
+
+    @property
+    def keys(self) -> set[tuple[str, str, int]]:
+        """What its rows are told from others by: task, method and first seed."""
+        return {(self.config.env.name, method, self.config.seed) for method in self.stages}
+
+
+def flat_config(task: str, strength: str, seed: int, seeds: int) -> Config:
+    """Return the config of flat PPO: the task's preset, or weak, as the paper's silence on it suggests."""
+    config, ticks = load_config(task), TICKS.get(task, MILLION)
+    ppo = load_config("paper").collect.ppo if strength == "weak" else config.collect.ppo
+    return dataclasses.replace(
+        config,
+        collect=CollectConfig(ticks=ticks, capacity=MILLION, ppo=ppo),
+        options=OptionsConfig(),  # what differs is told below; no preset may change it
+        train=dataclasses.replace(config.train, ticks=ticks, baselines=()),
+        evaluate=EvaluateConfig(episodes=20, video_ticks=0),
+        seed=seed,
+        seeds=seeds,
+    )
+
+
+def options_config(task: str, method: str, source: Path, seed: int, seeds: int) -> Config:
+    """Return the config of one kind of options, learnt from the experience of the strong flat PPO in `source`."""
+    rule, decoder, constraints = method.split("-")
+    config = flat_config(task, "strong", seed, seeds)
+    changes: dict[str, Any] = {"termination": rule, "decoder": decoder} | SETTINGS[decoder] | CONSTRAINTS[constraints]
+    changes |= {} if rule == "fixed" else VARIABLE
+    return dataclasses.replace(
+        config, options=dataclasses.replace(config.options, experience=(str(source),), **changes)
+    )
+
+
+def robots(task: str, run_dir: Path, chunk: int = 10) -> list[Cell]:
+    """Return the runs of figure 7 on one task, those that others take experience from first.
+
+    Seeds come in runs of `chunk`, so that what is interrupted costs little and more can be added.
+    """
+    cells = []
+    methods = METHODS | (OTHERS if task == "half_cheetah" else {})
+    for method, (_, minimum) in methods.items():
+        for first in range(0, minimum, chunk):
+            seed, seeds = FIRST_SEED + first, min(chunk, minimum - first)
+            after = f"-{seed}" if first else ""
+            if method in ("strong", "weak", "repeat"):
+                config = flat_config(task, method, seed, seeds)
+                stages = {method: "repeat" if method == "repeat" else "collect"}
+            else:
+                config = options_config(task, method, run_dir / task / f"strong{after}", seed, seeds)
+                stages = {method: "train"}
+            cells.append(Cell(f"{task}/{method}{after}", config, stages, "7" if method in METHODS else "6"))
+    return cells
+
+
+def transfers(task: str, run_dir: Path, seeds: int = 10) -> list[Cell]:
+    """Return the runs of figure 8 on one task; options and policy are those of the ant's run `ant/source`."""
+    source = dataclasses.replace(load_config("ant"), seed=FIRST_SEED, seeds=seeds)
+    config = load_config(f"transfer_{task}")
+    config = dataclasses.replace(
+        config,
+        options=dataclasses.replace(config.options, source=str(run_dir / "ant/source")),
+        evaluate=EvaluateConfig(episodes=20, video_ticks=0),
+        seed=FIRST_SEED,
+        seeds=seeds,
+    )
+    stages = {method: stage for method, (_, stage) in TRANSFERRED.items()}
+    return [Cell("ant/source", source, {}, "8"), Cell(f"{task}/transfer", config, stages, "8")]
+
+
+def recovery(run_dir: Path, seeds: int = 50) -> list[Cell]:
+    """Return the runs of figure 5: options of the room, and recovery after it changes."""
+    source = dataclasses.replace(load_config("nav2d"), seed=FIRST_SEED, seeds=seeds)
+    ppo = source.train.ppo  # nothing needs its policy over options: one iteration
+    train = dataclasses.replace(source.train, baselines=(), ticks=ppo.num_envs * ppo.rollout_length)
+    source = dataclasses.replace(source, train=train)
+    config = load_config("nav2d_change")
+    experience = (str(run_dir / "nav2d/source"),)
+    config = dataclasses.replace(
+        config,
+        options=dataclasses.replace(config.options, experience=experience),
+        seed=FIRST_SEED,
+        seeds=seeds,
+    )
+    stages = {method: stage for method, (_, stage) in RECOVERING.items()}
+    return [Cell("nav2d/source", source, {PATHS: "options"}, "5"), Cell("nav2d/change", config, stages, "5")]
+
+
+def all_cells(run_dir: Path) -> list[Cell]:
+    """Return every run of every figure, those that others start from before them."""
+    cells = recovery(run_dir)
+    for task in ROBOTS:
+        cells += robots(task, run_dir)
+    for task in TRANSFERS:
+        cells += [cell for cell in transfers(task, run_dir) if cell.name not in {known.name for known in cells}]
+    return cells

@@ -1,0 +1,72 @@
+"""What all figures share: colours, curves of many seeds, and marks for what is missing."""
+
+import textwrap
+from collections.abc import Sequence
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from taic_jax.statistics import iqm, stratified_interval
+
+# Okabe and Ito's palette, which readers who confuse colours can tell apart.
+GREY, BLACK, ORANGE, SKY, GREEN, BLUE, RED, PINK = (
+    "#8c8c8c", "#000000", "#e69f00", "#56b4e9", "#009e73", "#0072b2", "#d55e00", "#cc79a7",
+)  # fmt: skip
+WARNING = "#b00020"
+RESULTS = Path("experiments/results")
+
+plt.rcParams.update({
+    "font.size": 10, "axes.titlesize": 11, "axes.spines.top": False, "axes.spines.right": False,
+    "legend.frameon": False, "savefig.dpi": 110, "figure.constrained_layout.use": True,
+})  # fmt: skip
+
+
+def draw_curves(
+    axes: Axes, ticks: np.ndarray, values: np.ndarray, colour: str, label: str, dashed: bool = False
+) -> None:
+    """Draw every seed [K, G] as a thin line, their interquartile mean as a thick one, and its 95 % interval."""
+    axes.plot(ticks, values.T, color=colour, linewidth=0.5, alpha=0.3)
+    style = "--" if dashed else "-"
+    axes.plot(ticks, iqm(values, axis=0), style, color=colour, linewidth=2.2, label=label, zorder=3)
+    if len(values) > 1:
+        low, high = stratified_interval([values])
+        axes.fill_between(ticks, low, high, color=colour, alpha=0.18, linewidth=0, zorder=2)
+
+
+def interactions(axes: Axes, label: str) -> None:
+    """Write interactions in millions or thousands on the x-axis."""
+    top = axes.get_xlim()[1]
+    unit, letter = (1e6, "M") if top > 1e6 else (1e3, "k")
+    axes.xaxis.set_major_formatter(lambda value, _: f"{value / unit:g} {letter}")
+    axes.set_xlabel(label)
+
+
+def mark(axes: Axes, title: str, remarks: Sequence[str], width: int = 52) -> None:
+    """Title a panel, and write above it what is missing or mixed in it."""
+    axes.set_title(title, loc="left")
+    lines = [line for remark in remarks for line in textwrap.wrap(remark, width, subsequent_indent="   ")]
+    if lines:
+        axes.text(
+            0.0, 1.01, "\n".join(lines), transform=axes.transAxes, va="bottom", fontsize=7.5, color=WARNING,
+        )  # fmt: skip
+        axes.set_title(title, loc="left", pad=6 + 9.5 * len(lines))
+
+
+def empty(axes: Axes) -> None:
+    """Say that a panel has nothing to show."""
+    axes.set_xticks([])
+    axes.set_yticks([])
+    axes.text(0.5, 0.5, "no finished runs", transform=axes.transAxes, ha="center", color=WARNING)
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Write a picture."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path)
+    print(path)

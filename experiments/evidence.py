@@ -1,0 +1,163 @@
+"""Do the runs that the figures need, and keep a row of each in the table: see README.md beside this file.
+
+python -m taic_jax.experiments.evidence --list
+python -m taic_jax.experiments.evidence --only nav2d
+
+What is in the table is not run again; a finished run's folder is taken in as it is; what was interrupted goes on from
+its last checkpoint.
+"""
+
+import dataclasses
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import tyro
+
+from taic_jax.checkpoint import save_text
+from taic_jax.compilation import keep_programs
+from taic_jax.config import ConfigError, Shard
+from taic_jax.devices import Devices, make_devices, open_devices
+from taic_jax.experiments.cells import PATHS, Cell, all_cells
+from taic_jax.experiments.option_paths import paths_of
+from taic_jax.experiments.spaces import measure_spaces
+from taic_jax.experiments.table import TABLE, TableError, append_row, read_table, row_of
+from taic_jax.logging import RunLogger
+from taic_jax.pipeline import collect, make_envs, run_pipeline, train_baseline
+from taic_jax.run_folder import RunFolderError, claimed, prepare_folder
+from taic_jax.stage import CLOCK, Clock, Run
+from taic_jax.summary import as_summary
+from taic_jax.types import as_rows
+
+
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+    """Do the runs that are missing from the table."""
+
+    only: tuple[str, ...] = ()
+    """Do only the runs whose names start so, as in half_cheetah or half_cheetah/strong; empty does all."""
+    list: bool = False
+    """List every run and what is missing of it, and stop."""
+    table: Path = TABLE
+    """The table."""
+    run_dir: Path = Path("runs/evidence")
+    """Folder of the runs."""
+
+
+def missing(cell: Cell, known: set[tuple[str, str, int]]) -> bool:
+    """Return whether the table lacks a row of a run; one that gives none is asked for only by those that use it."""
+    return bool(cell.keys - known)
+
+
+def sources(cell: Cell, run_dir: Path) -> set[str]:
+    """Return the names of the runs that a run takes experience, options or policies from."""
+    options = cell.config.options
+    return {str(Path(name).relative_to(run_dir)) for name in (*options.experience, options.source) if name}
+
+
+def plan(cells: Sequence[Cell], only: tuple[str, ...], known: set[tuple[str, str, int]], run_dir: Path) -> list[Cell]:
+    """Return the runs to be done, and before them those that they take something from and that are not finished.
+
+    Raises:
+        TableError: no run has such a name.
+    """
+    unknown = [text for text in only if not any(cell.name.startswith(text) for cell in cells)]
+    if unknown:
+        raise TableError(f"--only: expected the start of a run's name, got {unknown[0]}; --list shows them")
+    wanted = [cell for cell in cells if missing(cell, known) and (not only or cell.name.startswith(only))]
+    needed = set().union(*(sources(cell, run_dir) for cell in wanted))
+    names = {cell.name for cell in wanted} | {name for name in needed if not finished(run_dir / name)}
+    return [cell for cell in cells if cell.name in names]
+
+
+def finished(folder: Path) -> bool:
+    """Return whether a run's folder holds all that a row is made of."""
+    return (folder / "summary.json").is_file()
+
+
+def do(cell: Cell, run_dir: Path, shard: Shard = "none") -> None:
+    """Do a run, or what is left of it, with its seeds split over devices where asked."""
+    folder = run_dir / cell.name
+    begun = (folder / "config.yaml").is_file()
+    if finished(folder):
+        prepare_folder(cell.config, folder, resume=True)  # only checks that it is this run
+    elif set(cell.stages.values()) <= {"collect", "repeat"} and cell.stages:
+        (stage,) = cell.stages.values()
+        run_flat(cell, folder, stage, make_devices(shard, cell.config), begun)
+    else:
+        run_pipeline(cell.config, folder, resume=begun, shard=shard)
+
+
+def make_row(cell: Cell, run_dir: Path, method: str, stage: str) -> dict[str, Any]:
+    """Return the row of one method of a finished run; of options on a robot with the measures of their spaces."""
+    if method == PATHS:
+        return paths_row(run_dir / cell.name, run_dir)
+    row = row_of(run_dir / cell.name, run_dir, method, stage)
+    if cell.figure in ("6", "7") and stage == "train":
+        row["numbers"] |= measure_spaces(run_dir / cell.name)
+    return row
+
+
+def paths_row(folder: Path, run_dir: Path) -> dict[str, Any]:
+    """Return the row of what the options of a finished run draw."""
+    row = row_of(folder, run_dir, PATHS, "train") | {"curves": {}, "grid": [], "ticks": 0}
+    return row | paths_of(folder)
+
+
+def run_flat(cell: Cell, folder: Path, stage: str, devices: Devices, resume: bool) -> None:
+    """Train flat PPO alone: `collect`, which keeps its experience, or a baseline."""
+    config = cell.config
+    env, source = make_envs(config)
+    prepare_folder(config, folder, resume=resume)
+    keys = jnp.stack([jax.random.key(config.seed + k) for k in range(config.seeds)])
+    with claimed(folder), RunLogger(folder) as logger:
+        clock = Clock.load(folder / CLOCK)
+        run = Run(as_rows([config], config.seeds), keys, folder, logger, clock, devices=devices)
+        logger.truncate("evaluate", -1)
+        trained = collect(run, source) if stage == "collect" else train_baseline(run, env, stage)
+    summary = as_summary(run, {stage: {"first": trained.first, "last": trained.last}})
+    save_text(folder / "summary.json", json.dumps(summary, indent=2) + "\n")
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """List or do the runs."""
+    arguments = tyro.cli(Arguments, args=args)
+    cells = all_cells(arguments.run_dir)
+    try:
+        known = {(row["task"], row["method"], row["seed"]) for row in read_table(arguments.table)}
+        planned = plan(cells, arguments.only, known, arguments.run_dir)
+        if arguments.list:
+            show(cells, planned, known, arguments)
+            return
+        keep_programs()
+        shard = open_devices("auto", max((cell.config.seeds for cell in planned), default=0))
+        for cell in planned:
+            print(f"{cell.name}: {cell.config.seeds} seeds from {cell.config.seed}", flush=True)
+            do(cell, arguments.run_dir, shard)
+            for method, stage in cell.stages.items():
+                if (cell.config.env.name, method, cell.config.seed) not in known:
+                    append_row(arguments.table, make_row(cell, arguments.run_dir, method, stage))
+    except (ConfigError, RunFolderError, TableError) as error:
+        print(f"evidence: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
+
+
+def show(cells: Sequence[Cell], planned: Sequence[Cell], known: set, arguments: Arguments) -> None:
+    """Print every run: its figure, its interactions, and what is known of it."""
+    for cell in cells:
+        if arguments.only and not cell.name.startswith(arguments.only):
+            continue
+        folder = arguments.run_dir / cell.name
+        begun = "finished, to be taken in" if finished(folder) else "begun" if folder.exists() else "missing"
+        state = "in the table" if cell.stages and not missing(cell, known) else begun
+        ticks = cell.config.train.ticks if "collect" not in cell.stages.values() else cell.config.collect.ticks
+        print(f"figure {cell.figure}  {cell.name:36} {cell.config.seeds:3} seeds x {ticks:9,} ticks  {state}")
+    print(f"{len(planned)} runs to do")
+
+
+if __name__ == "__main__":
+    main()

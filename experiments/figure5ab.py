@@ -1,0 +1,101 @@
+"""Figures 5a and 5b: interpolation between two options of the room, and one dimension of an option at a time.
+
+python -m taic_jax.experiments.figure5ab
+
+Reads the table alone. The numbers are means over option models with 95 % bootstrap intervals of their interquartile
+mean: how smoothly interpolated codes pass from one path to the other, beside codes of other windows between the same
+ends; and by how much each dimension moves the end point.
+"""
+
+import dataclasses
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+from matplotlib.axes import Axes
+
+from taic_jax.experiments.cells import PATHS, RECOVERY
+from taic_jax.experiments.drawing import BLUE, GREY, RED, RESULTS, mark, plt, save
+from taic_jax.experiments.figure7 import write_numbers
+from taic_jax.experiments.option_paths import SWEEP
+from taic_jax.experiments.table import TABLE, TableError, read_table, select
+from taic_jax.statistics import bootstrap_interval, iqm
+
+MODELS = 10
+FIELDS = ("measure", "models", "iqm", "low", "high", "remarks")
+
+
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+    """Draw figures 5a and 5b and write their numbers."""
+
+    table: Path = TABLE
+    """The table of finished runs."""
+    out: Path = RESULTS / "figure5ab.png"
+    """The picture; its numbers are written beside it as CSV."""
+
+
+def draw_paths(axes: Axes, paths: np.ndarray, originals: np.ndarray, values: np.ndarray) -> None:
+    """Draw decoded paths [I, L, 2] in the colours of their values [I], and original ones as red dashes."""
+    for path, value in zip(paths, (values - values.min()) / np.ptp(values), strict=True):
+        axes.plot(*path.T, color=plt.colormaps["viridis"](0.9 * value), linewidth=1.6)
+    for path in originals:
+        axes.plot(*path.T, "--", color=RED, linewidth=1.6)
+    axes.plot(0, 0, "o", color="black", markersize=3)
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_xlabel("x in m")
+
+
+def draw(example: dict[str, Any], rows: list[dict[str, Any]], remarks: Sequence[str], out: Path) -> None:
+    """Draw the interpolation, the effect of each dimension, and the numbers."""
+    between, paths, swept = (np.array(example[name]) for name in ("between", "interpolated", "swept"))
+    size = len(swept)
+    figure = plt.figure(figsize=(12.5, 6.6))
+    grid = figure.add_gridspec(2, 2 + (size + 1) // 2, width_ratios=[1.7, 0.8] + [1] * ((size + 1) // 2))
+    left = figure.add_subplot(grid[:, 0])
+    draw_paths(left, paths, between, np.arange(len(paths)))
+    left.set_ylabel("y in m")
+    mark(left, "a) between two options", remarks)
+    for d in range(size):
+        axes = figure.add_subplot(grid[d // ((size + 1) // 2), 2 + d % ((size + 1) // 2)])
+        draw_paths(axes, swept[d], between[:1], SWEEP)
+        axes.set_title(f"b) dimension {d + 1}" if d == 0 else f"dimension {d + 1}", loc="left")
+    numbers = {row["measure"]: row for row in rows}
+    groups = (("straightness", ("smoothness", "shuffled"), ("interpolated", "other windows")),
+              ("end point, m", [f"effect/{d}" for d in range(size)], [str(d + 1) for d in range(size)]))  # fmt: skip
+    for i, (label, names, ticks) in enumerate(groups):
+        axes = figure.add_subplot(grid[i, 1])
+        values = np.array([[numbers[name][key] for key in ("iqm", "low", "high")] for name in names])
+        errors = np.abs(values[:, 1:].T - values[:, 0])
+        colours = [BLUE, GREY] if i == 0 else BLUE
+        axes.bar(range(len(names)), values[:, 0], yerr=np.nan_to_num(errors), color=colours, capsize=3)
+        axes.set_xticks(range(len(names)), ticks, rotation=30 if i == 0 else 0, ha="right" if i == 0 else "center")
+        axes.set_ylabel(label)
+        if i:
+            axes.set_xlabel("dimension")
+    save(figure, out)
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Draw the figure and write its numbers."""
+    arguments = tyro.cli(Arguments, args=args)
+    try:
+        table = read_table(arguments.table)
+        runs = select(table, RECOVERY, PATHS, MODELS)
+    except TableError as error:
+        print(f"figure5ab: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
+    example = next(row["example"] for row in table if (row["task"], row["method"]) == (RECOVERY, PATHS))
+    rows = []
+    for name, values in runs.numbers.items():
+        told = dict(zip(("iqm", "low", "high"), (float(iqm(values)), *bootstrap_interval(values)), strict=True))
+        rows.append({"measure": name, "models": len(values), **told, "remarks": "; ".join(runs.remarks)})
+    draw(example, rows, runs.remarks, arguments.out)
+    write_numbers(rows, FIELDS, arguments.out.with_suffix(".csv"))
+
+
+if __name__ == "__main__":
+    main()

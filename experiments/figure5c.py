@@ -1,0 +1,124 @@
+"""Figure 5c: recovery from a sudden change of the room, and the numbers of claim C4.
+
+python -m taic_jax.experiments.figure5c
+
+Reads the table alone. A seed has recovered where at least 90 % of the last 100 training episodes within 200 000 ticks
+after the change reach the goal; see `experiments.recovery`.
+"""
+
+import dataclasses
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+from scipy import stats
+
+from taic_jax.experiments.cells import RECOVERING, RECOVERY
+from taic_jax.experiments.drawing import BLACK, RED, RESULTS, mark, plt, save
+from taic_jax.experiments.figure7 import write_numbers
+from taic_jax.experiments.recovery import AFTER, RECOVERED
+from taic_jax.experiments.table import TABLE, Runs, TableError, read_table, select
+from taic_jax.statistics import exact_interval
+
+SEEDS = 50
+BEFORE = 80_000
+"""Ticks before the change that are drawn."""
+COLOURS = {"options": RED, "flat": BLACK}
+FIELDS = ("method", "seeds", "changed", "learnt_before", "recovered", "low", "high", "recovered_of_learnt", "fisher_p",
+          "remarks")  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+    """Draw figure 5c and write its numbers."""
+
+    table: Path = TABLE
+    """The table of finished runs."""
+    out: Path = RESULTS / "figure5c.png"
+    """The picture; its numbers are written beside it as CSV."""
+
+
+def recovered(runs: Runs) -> np.ndarray:
+    """Return which seeds recovered [K]; one whose room never changed, or not for long enough, has not."""
+    return np.nan_to_num(runs.numbers["success_after"]) >= RECOVERED
+
+
+def numbers(runs: Runs) -> dict[str, Any]:
+    """Return what the table of the figure says of one method."""
+    back, learnt = recovered(runs), np.nan_to_num(runs.numbers["success_before"]) >= RECOVERED
+    count, total = int(back.sum()), len(back)
+    low, high = exact_interval(count, total)
+    short = int((runs.numbers["ticks_after"] < AFTER).sum())
+    remarks = [*runs.remarks] + ([f"{short} had fewer than {AFTER:,} ticks after the change"] if short else [])
+    return {
+        "method": runs.method, "seeds": total, "changed": int(np.isfinite(runs.numbers["changed_at"]).sum()),
+        "learnt_before": int(learnt.sum()), "recovered": count, "low": low, "high": high,
+        "recovered_of_learnt": f"{int((back & learnt).sum())}/{int(learnt.sum())}", "remarks": "; ".join(remarks),
+    }  # fmt: skip
+
+
+def around_the_change(runs: Runs, grid: np.ndarray) -> np.ndarray:
+    """Return the share of successes [K, G] at ticks counted from each seed's own change; NaN where it never came."""
+    rows = []
+    for curve, at in zip(runs.curves["success"], runs.numbers["changed_at"], strict=True):
+        known = np.isfinite(curve)
+        if np.isfinite(at) and known.any():
+            rows.append(np.interp(grid, runs.grid[known] - at, curve[known], left=np.nan, right=np.nan))
+    return np.array(rows)
+
+
+def draw(found: dict[str, Runs], rows: list[dict[str, Any]], out: Path) -> None:
+    """Draw the share of successes around the change, and how many seeds recovered."""
+    figure, (left, right) = plt.subplots(1, 2, figsize=(9.5, 3.8), width_ratios=(3, 1))
+    grid = np.linspace(-BEFORE, AFTER, 71)
+    for method, runs in found.items():
+        values = around_the_change(runs, grid)
+        label, colour = RECOVERING[method][0], COLOURS[method]
+        left.plot(grid, values.T, color=colour, linewidth=0.4, alpha=0.18)
+        count = np.isfinite(values).sum(axis=0)
+        mean = np.divide(np.nansum(values, axis=0), count, out=np.full(len(grid), np.nan), where=count > 0)
+        left.plot(grid, mean, color=colour, linewidth=2.4, label=f"{label}, mean", zorder=3)
+    left.axvline(0, color="#555555", linewidth=1, linestyle=":")
+    left.set_xlabel("interactions after the trap appeared")
+    left.xaxis.set_major_formatter(lambda value, _: f"{value / 1e3:g} k")
+    left.set_ylabel("share of episodes at the goal")
+    figure.legend(loc="outside lower left", ncols=2)
+    share = np.array([row["recovered"] / row["seeds"] for row in rows])
+    errors = np.abs(np.array([[row["low"], row["high"]] for row in rows]).T - share)
+    colours = [COLOURS[row["method"]] for row in rows]
+    right.bar(range(len(rows)), share, yerr=errors, color=colours, alpha=0.85, capsize=5)
+    names = [f"{RECOVERING[row['method']][0]}\n{row['recovered']} of {row['seeds']}" for row in rows]
+    right.set_xticks(range(len(rows)), names)
+    right.set_ylabel("share of seeds recovered")
+    right.set_ylim(0, 1)
+    mark(
+        left,
+        "a trap appears after 1000 episodes",
+        [f"{row['method']}: {row['remarks']}" for row in rows if row["remarks"]],
+    )
+    right.set_title(f"Fisher's exact p = {rows[0]['fisher_p']:.1g}", loc="left")
+    save(figure, out)
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Draw the figure and write its numbers."""
+    arguments = tyro.cli(Arguments, args=args)
+    try:
+        table = read_table(arguments.table)
+        found = {method: select(table, RECOVERY, method, SEEDS) for method in RECOVERING}
+    except TableError as error:
+        print(f"figure5c: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
+    rows = [numbers(runs) for runs in found.values()]
+    counts = [(row["recovered"], row["seeds"] - row["recovered"]) for row in rows]
+    for row in rows:
+        row["fisher_p"] = float(stats.fisher_exact(counts).pvalue)
+    draw(found, rows, arguments.out)
+    write_numbers(rows, FIELDS, arguments.out.with_suffix(".csv"))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,165 @@
+"""Figure 7: learning curves of options and of flat PPO on the robots, and the numbers of claim C2.
+
+python -m taic_jax.experiments.figure7
+
+Reads the table alone. A method with fewer seeds than it needs is marked on its panel, as is what is missing.
+"""
+
+import csv
+import dataclasses
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+from scipy import stats
+
+from taic_jax.experiments.cells import METHODS, ROBOTS
+from taic_jax.experiments.drawing import (
+    BLACK,
+    BLUE,
+    GREEN,
+    GREY,
+    ORANGE,
+    PINK,
+    RED,
+    RESULTS,
+    SKY,
+    draw_curves,
+    empty,
+    interactions,
+    mark,
+    plt,
+    save,
+)  # fmt: skip
+from taic_jax.experiments.table import TABLE, Runs, TableError, read_table, select
+from taic_jax.statistics import bootstrap_interval, holm, iqm, probability_of_improvement
+
+COLOURS = dict(zip(METHODS, (BLACK, GREY, PINK, SKY, ORANGE, BLUE, GREEN, RED), strict=True))
+BASELINE = "strong"
+FIELDS = (
+    "task", "method", "seeds", "ticks", "pretraining", "iqm", "low", "high", "auc", "auc_low", "auc_high",
+    "jump_start", "jump_starts_positive", "ticks_to_threshold", "reached", "improvement", "improvement_low",
+    "improvement_high", "p_holm", "improvement_on_weak", "remarks",
+)  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+    """Draw figure 7 and write its numbers."""
+
+    table: Path = TABLE
+    """The table of finished runs."""
+    out: Path = RESULTS / "figure7.png"
+    """The picture; its numbers are written beside it as CSV."""
+    tasks: tuple[str, ...] = ROBOTS
+    """Panels."""
+
+
+def read_methods(rows: Sequence[dict[str, Any]], task: str) -> tuple[dict[str, Runs], list[str]]:
+    """Return the methods that the table holds for a task, and remarks on those that it does not hold whole."""
+    found, remarks = {}, []
+    held = {row["method"] for row in rows if row["task"] == task}
+    for method, (label, minimum) in METHODS.items():
+        if method in held:
+            found[method] = select(rows, task, method, minimum)
+            remarks += [f"{label}: {remark}" for remark in found[method].remarks]
+    missing = [label for method, (label, _) in METHODS.items() if method not in held]
+    if missing:
+        remarks.append("missing: " + ", ".join(missing))
+    return found, remarks
+
+
+def numbers(runs: Runs, methods: dict[str, Runs]) -> dict[str, Any]:
+    """Return what the table of the figure says of one method, beside flat PPO on the same task."""
+    last, curve = runs.numbers["last"], runs.curves["return"]
+    area = np.nanmean(curve, axis=1)
+    row = {"task": runs.task, "method": runs.method, "seeds": len(last), "ticks": runs.ticks}
+    row |= {"pretraining": runs.pretraining, "remarks": "; ".join(runs.remarks)}
+    row |= dict(zip(("iqm", "low", "high"), (iqm(last), *bootstrap_interval(last)), strict=True))
+    row |= dict(zip(("auc", "auc_low", "auc_high"), (iqm(area), *bootstrap_interval(area)), strict=True))
+    if BASELINE not in methods:
+        return row
+    flat = methods[BASELINE]
+    # Half of what flat PPO ends with, or of what it gains where that is more.
+    threshold = iqm(flat.numbers["last"]) / 2
+    above = curve >= threshold
+    first = np.where(above.any(axis=1), runs.grid[above.argmax(axis=1)], np.inf)
+    row |= {"ticks_to_threshold": float(np.median(first)), "reached": f"{above.any(axis=1).sum()}/{len(last)}"}
+    if runs.method != BASELINE:
+        shared = [(runs.seeds.index(s), flat.seeds.index(s)) for s in runs.seeds if s in flat.seeds]
+        i, j = np.array(shared, int).reshape(-1, 2).T
+        jump = runs.numbers["first"][i] - flat.numbers["first"][j]
+        row |= {"jump_start": float(np.mean(jump)), "jump_starts_positive": f"{(jump > 0).sum()}/{len(jump)}"}
+        p, interval = probability_of_improvement(last, flat.numbers["last"])
+        row |= dict(zip(("improvement", "improvement_low", "improvement_high"), (p, *interval), strict=True))
+        row["p"] = float(stats.mannwhitneyu(last, flat.numbers["last"], alternative="greater").pvalue)
+    if "weak" in methods and runs.method not in (BASELINE, "weak"):
+        row["improvement_on_weak"] = probability_of_improvement(last, methods["weak"].numbers["last"])[0]
+    return row
+
+
+def adjust(rows: list[dict[str, Any]]) -> None:
+    """Adjust the p-values of each method over the tasks (Holm)."""
+    for method in {row["method"] for row in rows}:
+        tested = [row for row in rows if row["method"] == method and "p" in row]
+        for row, p in zip(tested, holm([row.pop("p") for row in tested]), strict=True):
+            row["p_holm"] = float(p)
+
+
+def draw(found: dict[str, tuple[dict[str, Runs], list[str]]], out: Path) -> None:
+    """Draw a column per task: over task ticks alone, and with the ticks that options were learnt from counted in."""
+    figure, panels = plt.subplots(2, len(found), figsize=(4.1 * len(found) + 0.4, 7.6), squeeze=False)
+    for column, (task, (methods, remarks)) in enumerate(found.items()):
+        for row, axes in enumerate(panels[:, column]):
+            for method, runs in methods.items():
+                shift = runs.pretraining if row else 0
+                flat = "-" not in method
+                draw_curves(axes, runs.grid + shift, runs.curves["return"], COLOURS[method], METHODS[method][0], flat)
+            if not methods:
+                empty(axes)
+                continue
+            axes.set_xlim(left=0)
+            interactions(axes, "interactions, pre-training counted in" if row else "interactions with the task")
+        mark(panels[0, column], task, remarks)
+    for axes in panels[:, 0]:
+        axes.set_ylabel("return of an episode")
+    lines = {line.get_label(): line for axes in panels[0] for line in axes.get_lines() if line.get_label()[0] != "_"}
+    figure.legend(lines.values(), lines.keys(), loc="outside lower center", ncols=4)
+    save(figure, out)
+
+
+def write_numbers(rows: list[dict[str, Any]], fields: Sequence[str], out: Path) -> None:
+    """Write and print the numbers."""
+    texts = [{k: f"{v:.4g}" if isinstance(v, float) else v for k, v in row.items()} for row in rows]
+    with out.open("w", newline="") as file:
+        writer = csv.DictWriter(file, fields)
+        writer.writeheader()
+        writer.writerows(texts)
+    for row in texts:
+        print("  ".join(f"{name} {row[name]}" for name in fields if row.get(name) not in (None, "")))
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Draw the figure and write its numbers."""
+    arguments = tyro.cli(Arguments, args=args)
+    try:
+        table = read_table(arguments.table)
+        found = {task: read_methods(table, task) for task in arguments.tasks}
+        if not any(methods for methods, _ in found.values()):
+            raise TableError(
+                f"{arguments.table}: no row of figure 7; python -m taic_jax.experiments.evidence makes them"
+            )
+    except TableError as error:
+        print(f"figure7: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
+    draw(found, arguments.out)
+    rows = [numbers(runs, methods) for methods, _ in found.values() for runs in methods.values()]
+    adjust(rows)
+    write_numbers(rows, FIELDS, arguments.out.with_suffix(".csv"))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,119 @@
+"""Figure 8: options of Ant, unchanged, on its harder tasks, and the numbers of claim C3.
+
+python -m taic_jax.experiments.figure8
+
+Reads the table alone. Success is to be within 5 m of the goal at the last tick of an episode (HIRO's definition); a
+seed's success is its share of evaluation episodes under its mean options.
+"""
+
+import dataclasses
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+from scipy import stats
+
+from taic_jax.experiments.cells import TRANSFERRED, TRANSFERS
+from taic_jax.experiments.drawing import BLACK, BLUE, RED, RESULTS, draw_curves, empty, interactions, mark, plt, save
+from taic_jax.experiments.figure7 import adjust, write_numbers
+from taic_jax.experiments.table import TABLE, Runs, TableError, read_table, select
+from taic_jax.statistics import bootstrap_interval, iqm, probability_of_improvement
+
+SEEDS = 10
+COLOURS = {"options": RED, "flat": BLACK, "transfer": BLUE}
+# Of the evaluation: name in the row, name in the table of numbers.
+MEASURES = {"final/success": "success", "final/closest_approach": "closest_approach", "mean/upside_down": "upside_down"}
+FIELDS = (
+    "task", "method", "seeds", "ticks", "iqm", "low", "high", *MEASURES.values(), "seeds_at_goal", "success_per_seed",
+    "improvement", "improvement_low", "improvement_high", "p_holm", "remarks",
+)  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+    """Draw figure 8 and write its numbers."""
+
+    table: Path = TABLE
+    """The table of finished runs."""
+    out: Path = RESULTS / "figure8.png"
+    """The picture; its numbers are written beside it as CSV."""
+    tasks: tuple[str, ...] = TRANSFERS
+    """Panels."""
+
+
+def numbers(runs: Runs, methods: dict[str, Runs]) -> dict[str, Any]:
+    """Return what the table of the figure says of one method; for options the worse of both comparisons."""
+    last = runs.numbers["last"]
+    row: dict[str, Any] = {"task": runs.task, "method": runs.method, "seeds": len(last), "ticks": runs.ticks}
+    row |= dict(zip(("iqm", "low", "high"), (iqm(last), *bootstrap_interval(last)), strict=True))
+    row |= {ours: float(np.mean(runs.numbers[name])) for name, ours in MEASURES.items() if name in runs.numbers}
+    if "final/success" in runs.numbers:
+        success = runs.numbers["final/success"]
+        row |= {"seeds_at_goal": f"{(success >= 0.5).sum()}/{len(success)}"}
+        row |= {"success_per_seed": " ".join(f"{x:.2g}" for x in success)}
+    others = [methods[name] for name in ("flat", "transfer") if name in methods]
+    if runs.method == "options" and others:
+        compared = [(*probability_of_improvement(last, x.numbers["last"]), x) for x in others]
+        p, interval, worse = min(compared, key=lambda c: c[0])
+        row |= dict(zip(("improvement", "improvement_low", "improvement_high"), (p, *interval), strict=True))
+        row["p"] = float(stats.mannwhitneyu(last, worse.numbers["last"], alternative="greater").pvalue)
+    return row | {"remarks": "; ".join(runs.remarks)}
+
+
+def read_methods(rows: Sequence[dict[str, Any]], task: str) -> tuple[dict[str, Runs], list[str]]:
+    """Return the methods that the table holds for a task, and remarks on those that it does not hold whole."""
+    held = {row["method"] for row in rows if row["task"] == task}
+    found = {name: select(rows, task, name, SEEDS) for name in TRANSFERRED if name in held}
+    remarks = [f"{TRANSFERRED[name][0]}: {remark}" for name, runs in found.items() for remark in runs.remarks]
+    missing = [label for name, (label, _) in TRANSFERRED.items() if name not in held]
+    return found, remarks + ([f"missing: {', '.join(missing)}"] if missing else [])
+
+
+def draw(found: dict[str, tuple[dict[str, Runs], list[str]]], out: Path) -> None:
+    """Draw a column per task: the return, and where there is a goal the share of ticks spent at it."""
+    figure, panels = plt.subplots(2, len(found), figsize=(4.1 * len(found) + 0.4, 7.0), squeeze=False)
+    for column, (task, (methods, remarks)) in enumerate(found.items()):
+        names = ("return", "mean/success")
+        for axes, name in zip(panels[:, column], names, strict=True):
+            held = {method: runs for method, runs in methods.items() if name in runs.curves}
+            for method, runs in held.items():
+                draw_curves(
+                    axes, runs.grid, runs.curves[name], COLOURS[method], TRANSFERRED[method][0], method != "options"
+                )
+            if held:
+                axes.set_xlim(left=0)
+                interactions(axes, "interactions with the task")
+            elif methods:
+                axes.set_axis_off()
+            else:
+                empty(axes)
+        mark(panels[0, column], task, remarks)
+    panels[0, 0].set_ylabel("return of an episode")
+    panels[1, 1 % len(found)].set_ylabel("share of ticks within 5 m of the goal")
+    lines = {line.get_label(): line for line in panels[0, 0].get_lines() if str(line.get_label())[0] != "_"}
+    figure.legend(lines.values(), lines.keys(), loc="outside lower center", ncols=3)
+    save(figure, out)
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Draw the figure and write its numbers."""
+    arguments = tyro.cli(Arguments, args=args)
+    try:
+        table = read_table(arguments.table)
+        found = {task: read_methods(table, task) for task in arguments.tasks}
+        if not any(methods for methods, _ in found.values()):
+            raise TableError(f"{arguments.table}: no row of figure 8; taic_jax.experiments.evidence makes them")
+    except TableError as error:
+        print(f"figure8: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
+    draw(found, arguments.out)
+    rows = [numbers(runs, methods) for methods, _ in found.values() for runs in methods.values()]
+    adjust(rows)
+    write_numbers(rows, FIELDS, arguments.out.with_suffix(".csv"))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,186 @@
+"""Evidence: what is run and what is not, the table of finished runs, and what figures refuse or mark."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tiny_runs import CONFIG, PPO, tiny_steps, with_fields
+
+from taic_jax.config import Config
+from taic_jax.experiments import evidence, figure5c, figure7, figure8
+from taic_jax.experiments.cells import Cell, all_cells
+from taic_jax.experiments.recovery import AFTER, recovery_of
+from taic_jax.experiments.table import TableError, append_row, config_hash, difference, read_table, row_of, select
+from taic_jax.pipeline import run_pipeline
+
+TICKS = 1000
+
+
+def made_row(task: str, method: str, seed: int, seeds: int, level: float, **changes) -> dict:
+    """Return a row of seeds whose returns rise to level + 0, 1, 2..."""
+    grid = np.arange(1, 51) * (TICKS // 50)
+    last = level + np.arange(seeds)
+    curves = {"return": np.outer(last, grid / TICKS).tolist()}
+    numbers = {"first": np.zeros(seeds).tolist(), "last": last.tolist()}
+    row = {
+        "task": task, "method": method, "seed": seed, "seeds": seeds, "ticks": TICKS, "pretraining": 0,
+        "config": "a", "versions": {"jax": "1"}, "stopped": {}, "grid": grid.tolist(), "curves": curves,
+        "numbers": numbers,
+    }  # fmt: skip
+    return row | changes
+
+
+@pytest.fixture
+def table(tmp_path):
+    return tmp_path / "table.jsonl"
+
+
+def written(table, *rows):
+    for row in rows:
+        append_row(table, row)
+    return str(table)
+
+
+def test_rows_come_back_and_a_broken_line_is_refused(table):
+    rows = [made_row("ant", "strong", 0, 2, 0.123456789), made_row("ant", "strong", 2, 3, float("nan"))]
+    written(table, *rows)
+    assert [row["seeds"] for row in read_table(table)] == [2, 3]
+    assert read_table(table)[0]["numbers"]["last"] == [0.12346, 1.1235]
+    runs = select(read_table(table), "ant", "strong", minimum=6)
+    assert runs.seeds == (0, 1, 2, 3, 4) and runs.curves["return"].shape == (5, 50)
+    assert np.isnan(runs.numbers["last"][2:]).all() and runs.remarks == ("5 of 6 seeds",)
+    table.write_text(table.read_text()[:-20])
+    with pytest.raises(TableError, match=r"table\.jsonl: line 2 is no row"):
+        read_table(table)
+
+
+UNFIT = {
+    "nothing": ([], "ant/strong: no row"),
+    "two configs": ([{"seed": 0}, {"seed": 9, "config": "b"}], "ant/strong: rows of 2 configs under one name: a, b"),
+    "a seed twice": ([{"seed": 0}, {"seed": 1}], "ant/strong: seed 1 stands in several rows"),
+}
+
+
+@pytest.mark.parametrize(("changes", "message"), UNFIT.values(), ids=UNFIT)
+def test_what_may_not_be_averaged_is_refused(changes, message):
+    rows = [made_row("ant", "strong", 0, 2, 1.0) | change for change in changes]
+    with pytest.raises(TableError, match=message):
+        select(rows, "ant", "strong")
+
+
+def test_mixed_versions_and_diverged_seeds_are_remarked():
+    rows = [made_row("ant", "weak", 0, 2, 1.0), made_row("ant", "weak", 2, 1, 1.0)]
+    rows[1] |= {"versions": {"jax": "2"}, "stopped": {"0": {"quantity": "reward", "after": 3}}}
+    assert select(rows, "ant", "weak").remarks == ("mixed versions of jax", "1 diverged")
+
+
+def test_the_hash_tells_configs_apart_but_not_seeds_or_folders(tmp_path):
+    def hashed(config, folder):
+        return config_hash(difference(config, Path(folder)))
+
+    def at(folder):
+        return with_fields(CONFIG, options__experience=(f"{folder}/ant/strong",), seed=3)
+
+    assert difference(Config(seed=5, seeds=7), tmp_path) == {}
+    assert hashed(at("runs/a"), "runs/a") == hashed(dataclasses.replace(at("x"), seed=9), "x")
+    assert hashed(at("x"), "x") != hashed(with_fields(at("x"), train__ticks=64), "x")
+
+
+def test_recovery_by_hand():
+    """Iterations of 50 000 ticks; the room changes within the third; the last 100 episodes within 200 000 count."""
+    unit = AFTER // 4
+    changed = [0, 0, 0.5, 1, 1, 1, 1]
+    episodes = [200, 100, 60, 50, 50, 80, 900]
+    reached = [0, 90, 30, 0, 40, 80, 0]
+    rows = [
+        {"ticks": (i + 1) * unit, "train/mean/changed": [c], "train/mean/success": [s / unit], "train/episodes": [e]}
+        for i, (c, e, s) in enumerate(zip(changed, episodes, reached, strict=True))
+    ]
+    shares, numbers = recovery_of(rows, "train")
+    np.testing.assert_allclose(shares[0, :3], [0, 0.9, 0.5])
+    assert numbers["changed_at"] == [2.5 * unit] and numbers["ticks_after"] == [4.5 * unit]
+    np.testing.assert_allclose(numbers["success_before"], [0.9])
+    np.testing.assert_allclose(numbers["success_after"], [120 / 130])
+    never = [row | {"train/mean/changed": [0]} for row in rows]
+    assert np.isnan(recovery_of(never, "train")[1]["success_after"]).all()
+
+
+def test_what_is_in_the_table_is_not_done_again(tmp_path):
+    cells = all_cells(tmp_path)
+    assert len({cell.name for cell in cells}) == len(cells)
+    keys = [key for cell in cells for key in cell.keys]
+    assert len(set(keys)) == len(keys), "no two runs give the same row"
+    for position, cell in enumerate(cells):
+        assert evidence.sources(cell, tmp_path) <= {before.name for before in cells[:position]}
+    names = [cell.name for cell in evidence.plan(cells, ("hopper/fixed-open-both",), set(), tmp_path)]
+    assert names == ["hopper/strong", "hopper/fixed-open-both"], "and what it learns from is done before"
+    known = {("hopper", "fixed-open-both", 200)}
+    assert evidence.plan(cells, ("hopper/fixed-open-both",), known, tmp_path) == []
+    with pytest.raises(TableError, match="expected the start of a run's name, got hoper"):
+        evidence.plan(cells, ("hoper",), set(), tmp_path)
+
+
+def test_runs_are_done_once_and_taken_in_as_rows(monkeypatch, tmp_path, table, capsys):
+    """A flat run, then options learnt from it; an interrupted call finds both finished and only makes the rows."""
+    flat = with_fields(CONFIG, collect__env="", options__experience=(), evaluate__video_ticks=0)
+    options = with_fields(flat, options__experience=(str(tmp_path / "flat"),), train__baselines=())
+    options = with_fields(options, env__change_after=1, train__ppo=dataclasses.replace(PPO, reset_at_change=True))
+    cells = [Cell("flat", flat, {"strong": "collect"}, "7"), Cell("options", options, {"options": "train"}, "5")]
+    monkeypatch.setattr(evidence, "all_cells", lambda run_dir: cells)
+    arguments = ["--run-dir", str(tmp_path), "--table", str(table)]
+    with tiny_steps():
+        evidence.main([*arguments, "--only", "flat"])
+        run_pipeline(options, tmp_path / "options")  # by another call of another program
+        monkeypatch.setattr(evidence, "run_pipeline", lambda *_, **__: pytest.fail("it is finished"))
+        evidence.main(arguments)
+    strong, taken = read_table(table)
+    assert (strong["method"], strong["pretraining"], strong["seed"], strong["seeds"]) == ("strong", 0, 0, 2)
+    assert (taken["method"], taken["pretraining"]) == ("options", 48)
+    assert taken["fields"]["options.experience"] == ["flat"] and taken["numbers"]["ticks_after"] == [0.0, 0.0]
+    assert len(taken["curves"]["return"]) == 2 and len(taken["grid"]) == 50
+    told = json.loads((tmp_path / "flat/summary.json").read_text())["methods"]["collect"]
+    np.testing.assert_allclose(strong["numbers"]["last"], told["return"]["per_seed"], rtol=1e-4)
+    monkeypatch.setattr(evidence, "do", lambda *_: pytest.fail("it is in the table"))
+    evidence.main(arguments)
+    evidence.main([*arguments, "--list"])
+    assert capsys.readouterr().out.count("in the table") == 2
+    evidence_row = row_of(tmp_path / "flat", tmp_path, "strong", "collect")
+    assert evidence_row["config"] == strong["config"]
+
+
+def test_figure_7_marks_what_is_missing(table, tmp_path, monkeypatch):
+    rows = [made_row("ant", "strong", 0, 20, 100.0), made_row("ant", "fixed-open-both", 0, 4, 1000.0)]
+    marked = []
+    monkeypatch.setattr(figure7, "mark", lambda axes, title, remarks: marked.append((title, *remarks)))
+    out = tmp_path / "figure7.png"
+    figure7.main(["--table", written(table, *rows), "--out", str(out), "--tasks", "ant", "hopper"])
+    assert out.stat().st_size > 10_000
+    (ant, hopper) = marked
+    assert ant[:2] == ("ant", "Fix-len: 4 of 10 seeds") and "missing: flat PPO, paper-like," in ant[2]
+    assert "missing: flat PPO, flat PPO, paper-like" in hopper[1]
+    numbers = out.with_suffix(".csv").read_text().splitlines()
+    assert "1,1,1" in numbers[2], "every seed of the one beats every seed of the other"
+
+
+def test_figures_refuse_an_empty_table(table, capsys):
+    for figure in (figure5c, figure7, figure8):
+        with pytest.raises(SystemExit) as error:
+            figure.main(["--table", str(table)])
+        assert error.value.code == 2
+    assert "evidence" in capsys.readouterr().err
+
+
+def test_figure_5c_counts_who_recovered(table, tmp_path):
+    rows = []
+    for method, share in (("options", 1.0), ("flat", 0.0)):
+        row = made_row("nav2d", method, 0, 50, 1.0)
+        row["curves"]["success"] = np.full((50, 50), share).tolist()
+        after = [share] * 40 + [1.0] * 10
+        row["numbers"] |= {"success_before": [1.0] * 50, "success_after": after, "changed_at": [500.0] * 50}
+        rows.append(row | {"numbers": row["numbers"] | {"ticks_after": [2.0 * AFTER] * 50}})
+    out = tmp_path / "figure5c.png"
+    figure5c.main(["--table", written(table, *rows), "--out", str(out)])
+    lines = out.with_suffix(".csv").read_text().splitlines()
+    assert lines[1].startswith("options,50,50,50,50,") and lines[2].startswith("flat,50,50,50,10,")
