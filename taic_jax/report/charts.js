@@ -80,6 +80,9 @@ function noteOf(all) {
     const most = thinned.reduce((a, b) => (a.stage.iterations > b.stage.iterations ? a : b)).stage;
     notes.push(`Decimated: of up to ${count(most.iterations)} iterations, ${count(most.x.length)} evenly spaced ones are drawn, as they were.`);
   }
+  const least = extent(all.flatMap((s) => s.curve.seeds.flat()));
+  if (view.log === "on" && least && least[0] <= 0) notes.push(least[1] > 0
+    ? "A logarithmic axis has no place for values up to 0: they are left out." : "Nothing is above 0: the axis is not logarithmic.");
   for (const s of unknown) notes.push(`${s.name}: pre-training in ${s.stage.uncounted.join(", ")} is not known, and not counted in.`);
   if (all.length && all.every((s) => s.curve.seeds.length === 1)) notes.push("One seed: there is no interval.");
   return notes.join(" ");
@@ -113,7 +116,7 @@ function frameOf(shown, width, zoomed) {
     width, height, inner, tall, x, y, whole, log,
     toX: (value) => MARGIN.left + ((value - x[0]) / (x[1] - x[0] || 1)) * inner,
     fromX: (pixel) => x[0] + ((pixel - MARGIN.left) / inner) * (x[1] - x[0]),
-    toY: (value) => (log && value <= 0 ? MARGIN.top + tall : MARGIN.top + (1 - (scale(value) - y[0]) / (y[1] - y[0])) * tall),
+    toY: (value) => MARGIN.top + (1 - (scale(value) - y[0]) / (y[1] - y[0])) * tall,
   };
 }
 
@@ -139,12 +142,16 @@ function drawAxes(svg, frame, shown) {
     draw("text", { class: "label", x: MARGIN.left + frame.inner / 2, y: frame.height - 6, "text-anchor": "middle" }, label));
 }
 
+function drawable(value, frame) {
+  return value !== null && (!frame.log || value > 0);
+}
+
 // An M where a gap ends, so that what is missing is not bridged.
 function path(xs, ys, frame) {
   let text = "";
   let open = false;
   ys.forEach((y, i) => {
-    if (y === null) { open = false; return; }
+    if (!drawable(y, frame)) { open = false; return; }
     text += `${open ? "L" : "M"}${frame.toX(xs[i]).toFixed(1)} ${frame.toY(y).toFixed(1)}`;
     open = true;
   });
@@ -156,9 +163,9 @@ function band(series, frame) {
   let text = "";
   let start = 0;
   while (start < low.length) {
-    if (low[start] === null) { start++; continue; }
+    if (!drawable(low[start], frame)) { start++; continue; }
     let end = start;
-    while (end + 1 < low.length && low[end + 1] !== null) end++;
+    while (end + 1 < low.length && drawable(low[end + 1], frame)) end++;
     const at = Array.from({ length: end - start + 1 }, (_, i) => start + i);
     const point = (i, y) => `${frame.toX(series.x[i]).toFixed(1)} ${frame.toY(y).toFixed(1)}`;
     text += "M" + at.map((i) => point(i, high[i])).join("L") + "L" + at.reverse().map((i) => point(i, low[i])).join("L") + "Z";
@@ -220,7 +227,7 @@ function interact(svg, task, shown, frame, readout) {
       if (steps[at] < series.x[0] || steps[at] > series.x[series.x.length - 1]) continue;
       const i = nearest(series.x, steps[at]);
       const { iqm, low, high } = series.curve;
-      if (iqm[i] !== null) cross.append(draw("circle", {
+      if (drawable(iqm[i], frame)) cross.append(draw("circle", {
         cx: frame.toX(series.x[i]), cy: frame.toY(iqm[i]), r: 4, style: `--own:${series.colour}`,
       }));
       const value = interval({ iqm: iqm[i], ci95: [low[i], high[i]] });

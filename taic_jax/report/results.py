@@ -44,11 +44,11 @@ def _from_summary(told: dict[str, Any]) -> dict[str, Any]:
     """Summarise the numbers per seed anew, in the one way that also serves a part of the seeds."""
     result = {}
     for mode in MODES:
-        result[mode] = summarize(told[mode]["per_seed"])
+        result[mode] = summarize(np.array(told[mode]["per_seed"], float))
         if "first_per_seed" in told[mode]:
-            result[f"{mode}_untrained"] = summarize(told[mode]["first_per_seed"])
+            result[f"{mode}_untrained"] = summarize(np.array(told[mode]["first_per_seed"], float))
     if "duration" in told:
-        result["duration"] = summarize(told["duration"]["per_seed"])
+        result["duration"] = summarize(np.array(told["duration"]["per_seed"], float))
     return result
 
 

@@ -26,12 +26,12 @@ function heading() {
     },
   }, own.querySelector("h2").textContent));
   document.querySelectorAll("h2").forEach((own) => own.setAttribute("tabindex", -1));
-  document.getElementById("top").append(
+  fill(document.getElementById("top"), {}, [
     make("h1", {}, "taic_jax ", make("span", {}, tasks.join(", "))),
     make("p", {}, `${data.runs.length} ${data.runs.length === 1 ? "run" : "runs"}` +
       (partial ? `, ${partial} of them partial` : "") + `; written ${data.made}`),
     data.notes.length ? make("ul", { class: "notes" }, data.notes.map((note) => make("li", {}, note))) : null,
-    make("nav", { "aria-label": "Sections" }, links));
+    make("nav", { "aria-label": "Sections" }, links)]);
 }
 
 function curveSection() {

@@ -60,9 +60,9 @@ function resultTables() {
     const told = rows.flatMap(({ method }) => [method.return, method.return_untrained].filter(Boolean));
     const range = extent(told.flatMap((summary) => [...summary.per_seed, ...summary.ci95]));
     return make("div", {}, make("h3", {}, task), table(`Results on ${task}`,
-      ["run", "method", "untrained", "after training", make("span", {}, "per seed, ", make("abbr", { title: "interquartile mean" }, "IQM"), " and interval"), "mean options", "ticks an option", "interactions", "pre-training", "seeds"],
+      ["run", "method", "untrained", "after training", "per seed", "mean options", "duration", "interactions", "pre-training", "seeds"],
       rows.map(({ run, method }) => resultRow(run, method, range)), { class: "results" }),
-      range ? make("p", { class: "fine axis-note" }, `Scale of the drawn column: ${number(range[0])} to ${number(range[1])}; ○ untrained IQM, dots seeds, bar the 95 % interval, line the IQM.`) : null);
+      range ? make("p", { class: "fine axis-note" }, `Scale of the column per seed: ${number(range[0])} to ${number(range[1])}; ○ untrained IQM, dots seeds, bar the 95 % interval, line the interquartile mean (IQM). Duration: ticks an option.`) : null);
   });
 }
 
@@ -73,12 +73,18 @@ function resultRow(run, method, range) {
   return make("tr", { "data-stage": method.stage },
     make("th", { scope: "row" }, run.name, run.facts.finished ? null : make("span", { class: "badge partial" }, "partial")),
     cell([swatchOf(run, method.stage), method.label, partial].filter(Boolean)),
-    cell(interval(method.return_untrained), { class: "n" }), cell(interval(method.return), { class: "n strong" }),
+    cell(twoLines(method.return_untrained), { class: "n" }), cell(twoLines(method.return), { class: "n strong" }),
     cell(method.return ? strip(method, range, colourFor(run, method.stage)) : "–"),
-    cell(interval(method.return_mean_option), { class: "n" }),
+    cell(twoLines(method.return_mean_option), { class: "n" }),
     cell(method.duration ? number(method.duration.iqm, 3) : "–", { class: "n" }),
     cell(count(method.ticks), { class: "n" }), cell((method.pretraining || !missing ? count(method.pretraining) : "") + missing, { class: "n" }),
     cell(String(seeds) + (method.return && method.return.iqm === null ? ", some stopped" : ""), { class: "n" }));
+}
+
+// The number, and its interval below it.
+function twoLines(summary) {
+  if (!summary || summary.iqm === null || summary.ci95[0] === null) return interval(summary);
+  return [number(summary.iqm), make("small", {}, `${number(summary.ci95[0])} … ${number(summary.ci95[1])}`)];
 }
 
 function colourFor(run, stage) {
