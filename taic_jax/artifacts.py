@@ -5,7 +5,7 @@ An artifact is a folder: the tree of arrays with leading axis K (one per seed), 
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -27,7 +27,29 @@ STRUCTURE = (
 )  # fmt: skip
 
 
-def describe(env: Env) -> dict[str, Any]:
+class Body(NamedTuple):
+    """What an artifact says of the environment it was made in: enough to read it without that environment."""
+
+    name: str
+    proprioception: str
+    proprioceptive_size: int
+    action_size: int
+
+
+def described_body(folder: Path) -> Body:
+    """Return the body that an artifact was made for, by its own description.
+
+    Raises:
+      ArtifactError: it has none.
+    """
+    try:
+        told = json.loads((folder / DESCRIPTION).read_text())
+        return Body(told["env"], *(told[name] for name in Body._fields[1:]))
+    except (OSError, ValueError, KeyError, TypeError):
+        raise ArtifactError(f"{folder / DESCRIPTION}: expected the description of an artifact, got none") from None
+
+
+def describe(env: Env | Body) -> dict[str, Any]:
     """Return what decides whether a body is the same: the name and size of its slice, and its actions."""
     return {
         "env": env.name,
@@ -37,7 +59,9 @@ def describe(env: Env) -> dict[str, Any]:
     }
 
 
-def read_description(folder: Path, kind: str, env: Env, structure: dict[str, Any] | None = None) -> dict[str, Any]:
+def read_description(
+    folder: Path, kind: str, env: Env | Body, structure: dict[str, Any] | None = None
+) -> dict[str, Any]:
     """Return the description of an artifact, checked to be of the body of `env` and of this structure.
 
     Raises:
@@ -63,7 +87,7 @@ def save_options(folder: Path, model: OptionModel, env: Env, config: OptionsConf
     _save(folder, model, describe(env) | _structure(config) | {"seeds": len(model.delta)})
 
 
-def load_options(source: Path, env: Env, config: OptionsConfig, seeds: int) -> OptionModel:
+def load_options(source: Path, env: Env | Body, config: OptionsConfig, seeds: int) -> OptionModel:
     """Load option models [seeds] from a run or an artifact; seed k takes the model k modulo their number.
 
     Raises:
@@ -79,7 +103,7 @@ def _structure(config: OptionsConfig) -> dict[str, Any]:
     return {f"options.{name}": getattr(config, name) for name in STRUCTURE}
 
 
-def _empty_model(networks: Any, config: OptionsConfig, env: Env) -> OptionModel:
+def _empty_model(networks: Any, config: OptionsConfig, env: Env | Body) -> OptionModel:
     zeros = jnp.zeros(env.proprioceptive_size)
     params = init_params(networks, config, jax.random.key(0))
     return OptionModel(params, Scale(zeros, zeros), Scale(zeros, zeros), jnp.zeros(()))

@@ -58,6 +58,7 @@ class Command:
 
 
 C = TypeVar("C", bound=Command)
+K = TypeVar("K")
 
 
 def answer(args: Sequence[str] | None, program: str, kind: type[C], execute: Callable[[C], int]) -> int:
@@ -69,8 +70,13 @@ def answer(args: Sequence[str] | None, program: str, kind: type[C], execute: Cal
       kind: what it takes.
       execute: does it.
     """
+    return tell(lambda: execute(parse(sys.argv[1:] if args is None else args, program, kind)))
+
+
+def tell(work: Callable[[], int]) -> int:
+    """Return the exit code of `work`, or 2 after one line that tells what mistake the user made."""
     try:
-        return execute(parse(sys.argv[1:] if args is None else args, program, kind))
+        return work()
     except KeyboardInterrupt:
         print("taic_jax: interrupted", file=sys.stderr)
         return 130
@@ -133,21 +139,32 @@ def parse(args: Sequence[str], program: str, kind: type[C]) -> C:
 def _parse_over(args: Sequence[str], program: str, kind: type[C], source: str) -> C:
     default = kind(source=source, config=load_config(source))
     description = f"{kind.__doc__}\n\nPresets: {', '.join(preset_names())}."
+    return typed(args, program, kind, description, default=default)
+
+
+def typed(args: Sequence[str], program: str, kind: type[K], description: str | None = None, **settings: Any) -> K:
+    """Parse arguments into `kind`, a dataclass whose fields all have defaults; `settings` are for tyro.
+
+    Raises:
+      ConfigError: one is not valid.
+    """
     if "-h" in args or "--help" in args:  # alone, or tyro leaves the arguments before it out of the help
         args = ["--help"]
     try:
         with contextlib.redirect_stderr(io.StringIO()):
-            return tyro.cli(kind, prog=program, description=description, args=args, default=default)
+            return tyro.cli(kind, prog=program, description=description, args=args, **settings)
     except SystemExit as stop:
         if not stop.code:
             raise
     raise _explain(args, kind)
 
 
-def _explain(args: Sequence[str], command: type[Command]) -> ConfigError:
+def _explain(args: Sequence[str], command: type) -> ConfigError:
     """Find the argument that tyro refused, by parsing each option alone, and tell it in one line."""
-    hints = {**get_type_hints(command), **{name: _kind(name) for name, _ in walk(Config())}}
-    known = {f"--{name}": kind for name, kind in hints.items() if name not in ("source", "config")}
+    hints = get_type_hints(command)
+    if hints.get("config") is Config:
+        hints |= {name: _kind(name) for name, _ in walk(Config())}
+    known = {f"--{name}": kind for name, kind in hints.items() if name not in ("source", "config", "runs")}
     for option, values in _options(args):
         name = "--" + option.lstrip("-").replace("-", "_")
         if name not in known:
@@ -157,7 +174,8 @@ def _explain(args: Sequence[str], command: type[Command]) -> ConfigError:
                 tyro.cli(command, args=[option, *values])
         except SystemExit:
             return mistyped(option, known[name], " ".join(values) or None)
-    return ConfigError(f"unexpected argument in {' '.join(args)!r}; expected one CONFIG and options, see --help")
+    expected = "one CONFIG and options" if "source" in hints else "options"
+    return ConfigError(f"unexpected argument in {' '.join(args)!r}; expected {expected}, see --help")
 
 
 def _options(args: Sequence[str]) -> Iterator[tuple[str, list[str]]]:

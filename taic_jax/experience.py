@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Key
 
-from taic_jax.artifacts import DESCRIPTION, read_description
+from taic_jax.artifacts import DESCRIPTION, Body, read_description
 from taic_jax.checkpoint import ArtifactError, save_text
 from taic_jax.config import CollectConfig
 from taic_jax.demonstrations import read_demonstrations
@@ -123,7 +123,7 @@ def read_experience(folder: Path, seed: int) -> Experience:
     return Experience(**{name: np.concatenate(arrays) for name, arrays in blocks.items()})
 
 
-def gather_experience(source: Path, env: Env, seeds: int) -> Experience:
+def gather_experience(source: Path, env: Env | Body, seeds: int) -> Experience:
     """Return [K, T, B, ...] of what a run collected, or of demonstrations, for the body of `env`.
 
     Seed k takes the run's seed k modulo their number; demonstrations are every seed's.

@@ -1,5 +1,6 @@
 """What options do when they are executed from chosen states, and how orderly that makes the option space (§4.2.1)."""
 
+from collections.abc import Sequence
 from functools import partial
 
 import jax
@@ -79,13 +80,18 @@ class Encoded(struct.PyTreeNode):
 
 
 def encode_windows(
-    config: OptionsConfig, model: OptionModel, experience: Experience, key: Key[Array, ""], count: int
+    config: OptionsConfig,
+    model: OptionModel,
+    experience: Experience | Sequence[Experience],
+    key: Key[Array, ""],
+    count: int,
 ) -> Encoded:
     """Encode `count` windows drawn from the selection, of `config.length` ticks each."""
     dataset = make_dataset(experience, config)
     which = jax.random.randint(key, (count,), 0, dataset.count)
     windows = gather(dataset, which, jnp.full(count, config.length), config.length)
-    networks = make_networks(config, experience.obs.shape[-1], experience.action.shape[-1])
+    rows = dataset.experience
+    networks = make_networks(config, rows.obs.shape[-1], rows.action.shape[-1])
     encode = partial(apply, networks.encoder, model.params["encoder"])
     means, log_stds = jax.vmap(encode)(windows.actions)
     return Encoded(means[:, -1], log_stds[:, -1], windows.states[:, 0], windows.states[:, -1])

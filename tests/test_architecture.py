@@ -9,7 +9,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PACKAGE = sorted((ROOT / "taic_jax").glob("*.py")) + sorted(
     path
-    for folder in ("envs", "experiments", "taic_jax/options", "taic_jax/rl", "taic_jax/sweep")
+    for folder in ("envs", "experiments", "taic_jax/options", "taic_jax/report", "taic_jax/rl", "taic_jax/sweep")
     for path in (ROOT / folder).rglob("*.py")
 )
 ALL = PACKAGE + sorted((ROOT / "tests").rglob("*.py"))
@@ -27,6 +27,7 @@ LAYERS = (
     "pipeline",
     "replay command_line",
     "run sweep",
+    "report",
     "experiments",
 )
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names.split()}

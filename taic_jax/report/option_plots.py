@@ -1,0 +1,131 @@
+"""The option space of a run, for a picture: codes on their first two principal components, and what they change."""
+
+import contextlib
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from taic_jax.artifacts import OPTIONS, Body, described_body, load_options
+from taic_jax.checkpoint import ArtifactError
+from taic_jax.config import COLLECT, ConfigError, OptionsConfig
+from taic_jax.config_io import load_config
+from taic_jax.experience import gather_experience
+from taic_jax.networks import apply
+from taic_jax.option_space import encode_windows
+from taic_jax.options.dataset import Experience
+from taic_jax.options.model import OptionModel, make_networks
+from taic_jax.report.curves import rounded
+from taic_jax.report.runs import RunData
+from taic_jax.types import as_arrays
+
+
+def option_plot(run: RunData, count: int) -> dict[str, Any]:
+    """Return the picture of the first seed's option model, ready for JSON, or why there is none.
+
+    The options are the means of q(o|a) over windows drawn from what the model was learnt from, coloured by the change
+    of state these windows recorded. Without that experience they are drawn from the prior, coloured by the change
+    that P predicts from the mean state.
+
+    Args:
+      run: whose options; it may have them from another run.
+      count: how many options, N.
+    """
+    if run.config is None:
+        return {"missing": "the config is of another version"}
+    if run.point:
+        return {"missing": "option spaces of a sweep's points are not drawn"}
+    source = Path(run.config.options.source or run.folder)
+    folder = source / OPTIONS if (source / OPTIONS).is_dir() else source
+    if folder == run.folder:
+        return {"missing": "options are not learnt yet"}
+    home, config = _learnt_in(run.folder, run.config.options)
+    try:
+        body = described_body(folder)
+        models = load_options(folder, body, config, 1)
+    except ArtifactError as error:
+        return {"missing": str(error)}
+    model = jax.tree.map(lambda x: x[0], models)
+    experience, why = _experience(home, config, body)
+    if experience:
+        option, change = _encoded(config, model, experience, count)
+    else:
+        option, change = _drawn(config, model, body, count)
+    return _picture(option, change) | {"drawn": "windows" if experience else "prior", "why": why, "folder": str(folder)}
+
+
+def _learnt_in(folder: Path, config: OptionsConfig) -> tuple[Path, OptionsConfig]:
+    """Return the run whose experience the options of a run were learnt from, and how they were."""
+    if not config.source:
+        return folder, config
+    source = Path(config.source)
+    source = source if (source / "config.yaml").is_file() else source.parent
+    with contextlib.suppress(ConfigError):
+        return source, load_config(source / "config.yaml").options
+    return source, config
+
+
+def _experience(folder: Path, config: OptionsConfig, body: Body) -> tuple[list[Experience], str]:
+    """Return the first seed's experience that options were learnt from, or none and why."""
+    sources = [folder if name == COLLECT else Path(name) for name in config.experience or (COLLECT,)]
+    try:
+        return [jax.tree.map(lambda x: x[0], gather_experience(source, body, 1)) for source in sources], ""
+    except (ArtifactError, OSError) as error:
+        return [], f"what they were learnt from is not there: {error}"
+
+
+def _encoded(
+    config: OptionsConfig, model: OptionModel, experience: list[Experience], count: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the codes [N, D] of windows and the changes [N, P] they recorded."""
+    encode = jax.jit(encode_windows, static_argnums=4)
+    windows = jax.device_get(encode(as_arrays(config), model, experience, jax.random.key(0), count))
+    return windows.mean, windows.end - windows.start
+
+
+def _drawn(config: OptionsConfig, model: OptionModel, body: Body, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return codes [N, D] drawn from the prior and the changes [N, P] that P predicts from the mean state."""
+    networks = make_networks(config, body.proprioceptive_size, body.action_size)
+    option = jax.random.normal(jax.random.key(0), (count, config.size))
+    predict = partial(apply, networks.predictor, model.params["predictor"], jnp.zeros(body.proprioceptive_size))
+    change = np.asarray(jax.vmap(predict)(option)) * np.asarray(model.change_scale.std)
+    return np.asarray(option), change + np.asarray(model.change_scale.mean)
+
+
+def _picture(option: np.ndarray, change: np.ndarray) -> dict[str, Any]:
+    """Project codes on their principal components, and tell how well these two tell each coordinate's change."""
+    plane, shares = principal_plane(option)
+    return {
+        "size": option.shape[1],
+        "x": rounded(plane[:, 0], 4),
+        "y": rounded(plane[:, 1], 4),
+        "shares": rounded(shares, 3),
+        "changes": [rounded(column, 3) for column in change.T],
+        "r2": rounded(np.array([_r2(plane, column) for column in change.T]), 3),
+    }
+
+
+def principal_plane(option: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return codes [N, D] in the plane [N, 2] of their first two principal components, and the variance these hold.
+
+    A space of one dimension has nothing in the second; signs are such that the largest weight is positive.
+    """
+    centred = option - option.mean(axis=0)
+    _, scales, axes = np.linalg.svd(centred, full_matrices=False)
+    axes = axes * np.sign(axes[np.arange(len(axes)), np.abs(axes).argmax(axis=1)])[:, None]
+    plane, shares = centred @ axes[:2].T, scales**2 / max((scales**2).sum(), np.finfo(float).tiny)
+    missing = 2 - plane.shape[1]
+    return np.pad(plane, ((0, 0), (0, max(missing, 0)))), np.pad(shares[:2], (0, max(missing, 0)))
+
+
+def _r2(plane: np.ndarray, change: np.ndarray) -> float:
+    """Return the share of a coordinate's change that is linear in the plane; NaN where it never changes."""
+    total = ((change - change.mean()) ** 2).sum()
+    if total < 1e-12 * len(change):
+        return float("nan")
+    inputs = np.column_stack([plane, np.ones(len(plane))])
+    residual = change - inputs @ np.linalg.lstsq(inputs, change, rcond=None)[0]
+    return float(1 - (residual**2).sum() / total)
