@@ -21,10 +21,11 @@ GREY, BLACK, ORANGE, SKY, GREEN, BLUE, RED, PINK = (
 WARNING = "#b00020"
 RESULTS = Path("experiments/results")
 
-plt.rcParams.update({
+styled = plt.rc_context({
     "font.size": 10, "axes.titlesize": 11, "axes.spines.top": False, "axes.spines.right": False,
     "legend.frameon": False, "savefig.dpi": 110, "figure.constrained_layout.use": True,
 })  # fmt: skip
+"""Of every function that draws a figure: its style, which to import it gives to no other's."""
 
 
 def draw_curves(

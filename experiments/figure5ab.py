@@ -18,7 +18,7 @@ import tyro
 from matplotlib.axes import Axes
 
 from taic_jax.experiments.cells import PATHS, RECOVERY
-from taic_jax.experiments.drawing import BLUE, GREY, RED, RESULTS, mark, plt, save
+from taic_jax.experiments.drawing import BLUE, GREY, RED, RESULTS, mark, plt, save, styled
 from taic_jax.experiments.figure7 import write_numbers
 from taic_jax.experiments.option_paths import SWEEP
 from taic_jax.experiments.table import TABLE, TableError, read_table, select
@@ -49,6 +49,7 @@ def draw_paths(axes: Axes, paths: np.ndarray, originals: np.ndarray, values: np.
     axes.set_xlabel("x in m")
 
 
+@styled
 def draw(example: dict[str, Any], rows: list[dict[str, Any]], remarks: Sequence[str], out: Path) -> None:
     """Draw the interpolation, the effect of each dimension, and the numbers."""
     between, paths, swept = (np.array(example[name]) for name in ("between", "interpolated", "swept"))

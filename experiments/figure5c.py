@@ -17,7 +17,7 @@ import tyro
 from scipy import stats
 
 from taic_jax.experiments.cells import RECOVERING, RECOVERY
-from taic_jax.experiments.drawing import BLACK, RED, RESULTS, mark, plt, save
+from taic_jax.experiments.drawing import BLACK, RED, RESULTS, mark, plt, save, styled
 from taic_jax.experiments.figure7 import write_numbers
 from taic_jax.experiments.recovery import AFTER, RECOVERED
 from taic_jax.experiments.table import TABLE, Runs, TableError, read_table, select
@@ -70,6 +70,7 @@ def around_the_change(runs: Runs, grid: np.ndarray) -> np.ndarray:
     return np.array(rows)
 
 
+@styled
 def draw(found: dict[str, Runs], rows: list[dict[str, Any]], out: Path) -> None:
     """Draw the share of successes around the change, and how many seeds recovered."""
     figure, (left, right) = plt.subplots(1, 2, figsize=(9.5, 3.8), width_ratios=(3, 1))

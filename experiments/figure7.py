@@ -33,6 +33,7 @@ from taic_jax.experiments.drawing import (
     mark,
     plt,
     save,
+    styled,
 )  # fmt: skip
 from taic_jax.experiments.table import TABLE, Runs, TableError, read_table, select
 from taic_jax.statistics import bootstrap_interval, holm, iqm, probability_of_improvement
@@ -109,6 +110,7 @@ def adjust(rows: list[dict[str, Any]]) -> None:
             row["p_holm"] = float(p)
 
 
+@styled
 def draw(found: dict[str, tuple[dict[str, Runs], list[str]]], out: Path) -> None:
     """Draw a column per task: over task ticks alone, and with the ticks that options were learnt from counted in."""
     figure, panels = plt.subplots(2, len(found), figsize=(4.1 * len(found) + 0.4, 7.6), squeeze=False)

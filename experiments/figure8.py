@@ -17,7 +17,19 @@ import tyro
 from scipy import stats
 
 from taic_jax.experiments.cells import TRANSFERRED, TRANSFERS
-from taic_jax.experiments.drawing import BLACK, BLUE, RED, RESULTS, draw_curves, empty, interactions, mark, plt, save
+from taic_jax.experiments.drawing import (
+    BLACK,
+    BLUE,
+    RED,
+    RESULTS,
+    draw_curves,
+    empty,
+    interactions,
+    mark,
+    plt,
+    save,
+    styled,
+)
 from taic_jax.experiments.figure7 import adjust, write_numbers
 from taic_jax.experiments.table import TABLE, Runs, TableError, read_table, select
 from taic_jax.statistics import bootstrap_interval, iqm, probability_of_improvement
@@ -72,6 +84,7 @@ def read_methods(rows: Sequence[dict[str, Any]], task: str) -> tuple[dict[str, R
     return found, remarks + ([f"missing: {', '.join(missing)}"] if missing else [])
 
 
+@styled
 def draw(found: dict[str, tuple[dict[str, Runs], list[str]]], out: Path) -> None:
     """Draw a column per task: the return, and where there is a goal the share of ticks spent at it."""
     figure, panels = plt.subplots(2, len(found), figsize=(4.1 * len(found) + 0.4, 7.0), squeeze=False)

@@ -4,12 +4,13 @@ import dataclasses
 import json
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from tiny_runs import CONFIG, PPO, tiny_steps, with_fields
 
 from taic_jax.config import Config
-from taic_jax.experiments import evidence, figure5c, figure7, figure8
+from taic_jax.experiments import drawing, evidence, figure5c, figure7, figure8
 from taic_jax.experiments.cells import Cell, all_cells
 from taic_jax.experiments.recovery import AFTER, recovery_of
 from taic_jax.experiments.table import TableError, append_row, config_hash, difference, read_table, row_of, select
@@ -184,3 +185,9 @@ def test_figure_5c_counts_who_recovered(table, tmp_path):
     figure5c.main(["--table", written(table, *rows), "--out", str(out)])
     lines = out.with_suffix(".csv").read_text().splitlines()
     assert lines[1].startswith("options,50,50,50,50,") and lines[2].startswith("flat,50,50,50,10,")
+
+
+def test_the_style_of_figures_is_theirs_alone():
+    before = dict(plt.rcParams)
+    drawing.styled(lambda: None)()
+    assert dict(plt.rcParams) == before and not before["figure.constrained_layout.use"]

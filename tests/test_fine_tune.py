@@ -129,7 +129,7 @@ def test_a_run_fine_tunes_in_turns_and_goes_on_where_it_stopped(tmp_path, monkey
     config = with_fields(
         CONFIG, train__fine_tune=FineTuneConfig(every=1, learning_rate=0.01), train__ticks=4 * 16, train__baselines=()
     )
-    with tiny_steps(tmp_path / "cache"):
+    with tiny_steps():
         whole = run_pipeline(config, tmp_path / "whole")
         die(monkeypatch, Checkpoints, "save", 3 + 2 + 2)  # after collect's and learn's, in the last step of train
         with pytest.raises(KilledError):

@@ -34,6 +34,7 @@ def test_there_is_something_to_run():
     assert blocks("python") and commands()
 
 
+@pytest.mark.timeout(900)
 @pytest.mark.parametrize("code", blocks("python"))
 def test_python_blocks_run(code, tmp_path):
     (tmp_path / "block.py").write_text(code)
