@@ -59,15 +59,17 @@ class Arguments:
     """Panels."""
 
 
-def read_methods(rows: Sequence[dict[str, Any]], task: str) -> tuple[dict[str, Runs], list[str]]:
-    """Return the methods that the table holds for a task, and remarks on those that it does not hold whole."""
+def read_methods(
+    rows: Sequence[dict[str, Any]], task: str, methods: dict[str, tuple[str, int]]
+) -> tuple[dict[str, Runs], list[str]]:
+    """Return those of the methods, each with label and fewest seeds, that the table holds for a task, and remarks."""
     found, remarks = {}, []
     held = {row["method"] for row in rows if row["task"] == task}
-    for method, (label, minimum) in METHODS.items():
+    for method, (label, minimum) in methods.items():
         if method in held:
             found[method] = select(rows, task, method, minimum)
             remarks += [f"{label}: {remark}" for remark in found[method].remarks]
-    missing = [label for method, (label, _) in METHODS.items() if method not in held]
+    missing = [label for method, (label, _) in methods.items() if method not in held]
     if missing:
         remarks.append("missing: " + ", ".join(missing))
     return found, remarks
@@ -149,7 +151,7 @@ def main(args: Sequence[str] | None = None) -> None:
     arguments = tyro.cli(Arguments, args=args)
     try:
         table = read_table(arguments.table)
-        found = {task: read_methods(table, task) for task in arguments.tasks}
+        found = {task: read_methods(table, task, METHODS) for task in arguments.tasks}
         if not any(methods for methods, _ in found.values()):
             raise TableError(
                 f"{arguments.table}: no row of figure 7; python -m taic_jax.experiments.evidence makes them"

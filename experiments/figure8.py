@@ -30,8 +30,8 @@ from taic_jax.experiments.drawing import (
     save,
     styled,
 )
-from taic_jax.experiments.figure7 import adjust, write_numbers
-from taic_jax.experiments.table import TABLE, Runs, TableError, read_table, select
+from taic_jax.experiments.figure7 import adjust, read_methods, write_numbers
+from taic_jax.experiments.table import TABLE, Runs, TableError, read_table
 from taic_jax.statistics import bootstrap_interval, iqm, probability_of_improvement
 
 SEEDS = 10
@@ -75,15 +75,6 @@ def numbers(runs: Runs, methods: dict[str, Runs]) -> dict[str, Any]:
     return row | {"remarks": "; ".join(runs.remarks)}
 
 
-def read_methods(rows: Sequence[dict[str, Any]], task: str) -> tuple[dict[str, Runs], list[str]]:
-    """Return the methods that the table holds for a task, and remarks on those that it does not hold whole."""
-    held = {row["method"] for row in rows if row["task"] == task}
-    found = {name: select(rows, task, name, SEEDS) for name in TRANSFERRED if name in held}
-    remarks = [f"{TRANSFERRED[name][0]}: {remark}" for name, runs in found.items() for remark in runs.remarks]
-    missing = [label for name, (label, _) in TRANSFERRED.items() if name not in held]
-    return found, remarks + ([f"missing: {', '.join(missing)}"] if missing else [])
-
-
 @styled
 def draw(found: dict[str, tuple[dict[str, Runs], list[str]]], out: Path) -> None:
     """Draw a column per task: the return, and where there is a goal the share of ticks spent at it."""
@@ -114,16 +105,17 @@ def draw(found: dict[str, tuple[dict[str, Runs], list[str]]], out: Path) -> None
 def main(args: Sequence[str] | None = None) -> None:
     """Draw the figure and write its numbers."""
     arguments = tyro.cli(Arguments, args=args)
+    methods = {name: (label, SEEDS) for name, (label, _) in TRANSFERRED.items()}
     try:
         table = read_table(arguments.table)
-        found = {task: read_methods(table, task) for task in arguments.tasks}
-        if not any(methods for methods, _ in found.values()):
+        found = {task: read_methods(table, task, methods) for task in arguments.tasks}
+        if not any(held for held, _ in found.values()):
             raise TableError(f"{arguments.table}: no row of figure 8; taic_jax.experiments.evidence makes them")
     except TableError as error:
         print(f"figure8: {error}", file=sys.stderr)
         raise SystemExit(2) from None
     draw(found, arguments.out)
-    rows = [numbers(runs, methods) for methods, _ in found.values() for runs in methods.values()]
+    rows = [numbers(runs, held) for held, _ in found.values() for runs in held.values()]
     adjust(rows)
     write_numbers(rows, FIELDS, arguments.out.with_suffix(".csv"))
 

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tiny_runs import CONFIG, KilledError, die, last_state, rows_of, tiny_steps, with_fields
+from tiny_runs import CONFIG, SLOPE, KilledError, die, last_state, rows_of, tiny_steps, with_fields
 
 from taic_jax.checkpoint import Checkpoints
 from taic_jax.config_io import to_yaml
@@ -18,17 +18,6 @@ from taic_jax.envs import PhysicsState, make_env
 from taic_jax.envs.physics.mujoco import num_physical_cores
 from taic_jax.run import main
 
-SLOPE = """
-from probes import NO, Probe
-
-
-class Slope(Probe):
-    name = "slope"
-    episode_length = 8
-
-    def move(self, x, action):
-        return 0.5 * x + action, action - x, NO, NO
-"""
 STAGES = ("collect", "learn", "train")
 
 

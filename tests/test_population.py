@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from probes import numbers
-from test_sweep import FEW, SLOPE, table_of
-from tiny_runs import CONFIG, KilledError, die, tiny_steps, with_fields
+from test_sweep import FEW, table_of
+from tiny_runs import CONFIG, SLOPE, KilledError, die, tiny_steps, with_fields
 
 from taic_jax.checkpoint import Checkpoints
 from taic_jax.config import Config, replace

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from tiny_runs import CONFIG, KilledError, die, tiny_steps, with_fields
+from tiny_runs import CONFIG, SLOPE, KilledError, die, tiny_steps, with_fields
 
 from taic_jax.checkpoint import Checkpoints
 from taic_jax.config import Config, ConfigError
@@ -18,17 +18,6 @@ from taic_jax.sweep.__main__ import main
 from taic_jax.sweep.axes import chunks, configs_of, grid, is_leaf, parse_axis, sample
 
 RATE, LENGTH = "train.ppo.learning_rate=3e-4,0.03", "options.length=2,3"
-SLOPE = """
-from probes import NO, Probe
-
-
-class Slope(Probe):
-    name = "slope"
-    episode_length = 8
-
-    def move(self, x, action):
-        return 0.5 * x + action, action - x, NO, NO
-"""
 FEW = ["--chunk", "2", "--checkpoint-seconds", "0"]
 
 

@@ -23,6 +23,19 @@ CONFIG = Config(
     seeds=2,
 )
 
+# A task for a run's folder, `slope.py:Slope`, on which learning changes the return.
+SLOPE = """
+from probes import NO, Probe
+
+
+class Slope(Probe):
+    name = "slope"
+    episode_length = 8
+
+    def move(self, x, action):
+        return 0.5 * x + action, action - x, NO, NO
+"""
+
 
 def with_fields(config: Config, **fields: Any) -> Config:
     """Replace fields given by their dotted names, each dot written as two underscores."""
