@@ -3,6 +3,7 @@
 import os
 import sys
 from pathlib import Path
+from typing import BinaryIO
 
 import matplotlib.figure
 import matplotlib.patches
@@ -121,8 +122,9 @@ def render_room(
     return np.stack(frames)
 
 
-def write_webp(path: Path, frames: Frames, dt: float) -> None:
+def write_webp(file: Path | BinaryIO, frames: Frames, dt: float) -> None:
     """Write frames that are `dt` seconds apart as an animation in real time, at most 25 a second."""
     every = max(round(0.04 / dt), 1)
     images = [Image.fromarray(frame) for frame in frames[::every]]
-    images[0].save(path, save_all=True, append_images=images[1:], duration=round(1000 * dt * every), loop=0)
+    duration = round(1000 * dt * every)
+    images[0].save(file, format="webp", save_all=True, append_images=images[1:], duration=duration, loop=0)

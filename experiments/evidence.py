@@ -18,7 +18,6 @@ import jax
 import jax.numpy as jnp
 import tyro
 
-from taic_jax.checkpoint import save_text
 from taic_jax.compilation import keep_programs
 from taic_jax.config import ConfigError, Shard
 from taic_jax.devices import Devices, make_devices, open_devices
@@ -26,6 +25,7 @@ from taic_jax.experiments.cells import PATHS, Cell, all_cells
 from taic_jax.experiments.option_paths import paths_of
 from taic_jax.experiments.spaces import measure_spaces
 from taic_jax.experiments.table import TABLE, TableError, append_row, read_table, row_of
+from taic_jax.files import save_text
 from taic_jax.logging import RunLogger
 from taic_jax.pipeline import collect, make_envs, run_pipeline, train_baseline
 from taic_jax.run_folder import RunFolderError, claimed, prepare_folder

@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from taic_jax.checkpoint import save_text
 from taic_jax.config import Config, walk
 from taic_jax.config_io import load_config
 from taic_jax.experiments.recovery import recovery_of
+from taic_jax.files import save_text
 from taic_jax.logging import read_metrics
 
 TABLE = Path("experiments/results/evidence.jsonl")

@@ -11,9 +11,10 @@ import jax
 import jax.numpy as jnp
 
 from taic_jax import normalize
-from taic_jax.checkpoint import ArtifactError, load_tree, save_text, save_tree
+from taic_jax.checkpoint import ArtifactError, load_tree, save_tree
 from taic_jax.config import OptionsConfig, PPOConfig
 from taic_jax.envs.base import Env
+from taic_jax.files import save_text
 from taic_jax.networks import PolicyParams
 from taic_jax.options.model import OptionModel, Scale, init_params, make_networks
 from taic_jax.rl.ppo import Agent, Policy

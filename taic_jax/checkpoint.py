@@ -1,13 +1,20 @@
 """Trees of arrays on disk: artifacts of a stage and checkpoints of a run, through Orbax.
 
 A tree is stored flat, one array under each leaf's dotted name. So what is on disk can be compared with what
-is asked for before anything is read, and anyone can read it: Orbax's `load(path)` gives a dict.
+is asked for before anything is read, and anyone can read it: Orbax's `load(path)` gives a dict. Checkpoints, which
+are many, hold the bytes of all leaves as one array instead, as Orbax's time is spent per array; their names, dtypes
+and shapes are told in its metadata, and so are checksums, and the version of this package.
 """
 
 import contextlib
+import logging
+import math
 import os
+import re
 import shutil
-from collections.abc import Iterator
+import zlib
+from collections.abc import Callable, Iterator
+from importlib import metadata
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -16,69 +23,85 @@ import jax.numpy as jnp
 import numpy as np
 from orbax.checkpoint import v1 as ocp
 
-Tree = TypeVar("Tree")
+from taic_jax.files import PARTIAL, TEMPORARY, SaveError, make_room, writing
 
-PARTIAL = ".partial"
-"""Ending of a file that is not whole yet."""
-TEMPORARY = ".orbax-checkpoint-tmp"  # Orbax writes under this suffix, and renames when all is written
+Tree = TypeVar("Tree")
+Spec = tuple[tuple[int, ...], np.dtype]
+
+VERSION, CHECKSUMS, LAYOUT = "taic_jax", "crc32", "layout"  # keys of what is told beside the arrays
+PACKED = "bytes"  # the one array of a checkpoint
+
+# Orbax's threads also log what it raises, in hundreds of lines.
+logging.getLogger("absl").addFilter(lambda record: "orbax" not in Path(record.pathname).parts)
 
 
 class ArtifactError(ValueError):
     """Something on disk is not the tree of arrays that was asked for."""
 
 
-def save_text(path: Path, text: str) -> None:
-    """Write a text file, whole or not at all, in place of what was there."""
-    partial = path.with_name(path.name + PARTIAL)
-    partial.write_text(text)
-    os.replace(partial, path)
-
-
 def save_tree(path: Path, tree: Any) -> None:
-    """Write a tree of arrays to the folder `path`, whole or not at all, in place of what was there."""
+    """Write a tree of arrays to the folder `path`, whole or not at all, in place of what was there.
+
+    Raises:
+        SaveError: it cannot be written; what was there still is.
+    """
     path = path.absolute()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    arrays = {name: _to_plain(leaf) for name, leaf in _named(tree).items() if leaf.size}
-    ocp.save(str(path), arrays, overwrite=True)
+    partial = path.with_name(path.name + PARTIAL)  # Orbax would remove what is there before it writes
+    with _saving(path, partial):
+        _begin(partial, _plain(tree), {})()
+        if path.exists():
+            shutil.rmtree(path)
+        partial.rename(path)
+
+
+def load_arrays(path: Path) -> dict[str, np.ndarray]:
+    """Read what `save_tree` or `Checkpoints` wrote, by dotted name, without arrays that have no entries.
+
+    Raises:
+        ArtifactError: nothing is there, or something else, or it is damaged.
+    """
+    return _read(path, _describe(path)[1])
 
 
 def load_tree(path: Path, like: Tree) -> Tree:
     """Read a tree of arrays with the structure, shapes and dtypes of `like`, and onto its devices.
 
     Args:
-        path: the folder that `save_tree` wrote.
+        path: the folder that `save_tree` or `Checkpoints` wrote.
         like: arrays or `jax.ShapeDtypeStruct`s.
 
     Raises:
-        ArtifactError: nothing is there, or it is not a tree like this one.
+        ArtifactError: nothing is there, or it is not a tree like this one, or it is damaged.
     """
-    path = path.absolute()
-    if not path.exists():
-        raise ArtifactError(f"{path}: expected an artifact, got nothing")
     named = _named(like)
-    with _errors_in_one_line(path):
-        stored = {name: (meta.shape, meta.dtype) for name, meta in ocp.metadata(str(path)).metadata.items()}
-    _check(path, stored, {name: _plain_spec(leaf) for name, leaf in named.items() if leaf.size})
-    with _errors_in_one_line(path):
-        as_numpy = {name: np.empty(shape, dtype) for name, (shape, dtype) in stored.items()}
-        arrays = ocp.load(str(path), as_numpy)
+    stored, told = _describe(path)
+    expected = {name: _plain_spec(leaf) for name, leaf in named.items() if leaf.size}
+    for name in {**expected, **stored}:
+        want, got = expected.get(name), stored.get(name)
+        if want != got:
+            writer = told.get(VERSION, _version())
+            by = "" if writer == _version() else f"; taic_jax {writer} wrote it, this is {_version()}"
+            raise ArtifactError(f"{path}: expected {_show(want)} at {name or 'the root'}, got {_show(got)}{by}")
+    arrays = _read(path, told)
     leaves = [_from_plain(arrays.get(name), leaf) for name, leaf in named.items()]
     return jax.tree.unflatten(jax.tree.structure(like), leaves)
 
 
 class Checkpoints:
-    """The last few checkpoints of a run, each a folder named by its step.
+    """The last few checkpoints of a run, each a folder named by its step, written while the run goes on.
 
     Args:
         directory: the folder that holds them.
-        keep: how many of the latest to keep.
+        keep: how many of the latest to keep; older ones, which a killed run may have left, are removed.
+
+    Raises:
+        SaveError: they cannot be removed.
     """
 
     def __init__(self, directory: Path, keep: int = 2):
         self.directory, self.keep = directory.absolute(), keep
-        # A run that was killed while it saved leaves a half-written folder, which Orbax never removes.
-        for leftover in self.directory.glob(f"*{TEMPORARY}*"):
-            shutil.rmtree(leftover)
+        self._pending: tuple[Path, Callable[[], None]] | None = None
+        self._drop()
 
     def steps(self) -> list[int]:
         """List the steps that can be loaded, earliest first."""
@@ -89,28 +112,167 @@ class Checkpoints:
         return max(self.steps(), default=None)
 
     def save(self, step: int, tree: Any) -> None:
-        """Save a tree of arrays as this step, whole or not at all, and drop the oldest steps."""
-        save_tree(self.directory / str(step), tree)
-        for old in self.steps()[: -self.keep]:
-            shutil.rmtree(self.directory / str(old))
+        """Begin to save a tree of arrays as this step, whole or not at all, once the step before is saved.
+
+        The arrays are read here, so they may be donated afterwards.
+
+        Raises:
+            SaveError: this step or the one before cannot be written; those that were saved are still there.
+        """
+        self.wait()
+        path = self.directory / str(step)
+        packed, layout = _pack(_plain(tree))
+        options = ocp.options.ArrayOptions(saving=ocp.options.ArrayOptions.Saving(use_ocdbt=False))  # for many arrays
+        with _saving(path, path), ocp.Context(array_options=options):
+            self._pending = path, _begin(path, {PACKED: packed}, {LAYOUT: layout})
+
+    def wait(self) -> None:
+        """Wait until the step is saved that is being saved, if one is, and drop the oldest steps.
+
+        Raises:
+            SaveError: it cannot be written; those before it are still there.
+        """
+        if self._pending is None:
+            return
+        (path, finish), self._pending = self._pending, None
+        with _saving(path, path):
+            finish()
+        self._drop()
+
+    @contextlib.contextmanager
+    def waited_for(self) -> Iterator[None]:
+        """End the context, however it ends, with nothing being saved any more.
+
+        Raises:
+            SaveError: the last step cannot be written; what ends the context is told first.
+        """
+        try:
+            yield
+        except SaveError:
+            with contextlib.suppress(SaveError):
+                self.wait()
+            raise
+        except BaseException:
+            self.wait()
+            raise
+        self.wait()
+
+    def _drop(self) -> None:
+        with writing(self.directory):
+            for old in self.steps()[: -self.keep]:
+                shutil.rmtree(self.directory / str(old))
 
     def load(self, step: int, like: Tree) -> Tree:
-        """Load the tree of this step; see `load_tree`."""
-        return load_tree(self.directory / str(step), like)
+        """Load the tree of this step.
+
+        Raises:
+            ArtifactError: see `load_tree`; the message tells what is left without this step.
+        """
+        path = self.directory / str(step)
+        try:
+            return load_tree(path, like)
+        except ArtifactError as error:
+            before = [earlier for earlier in self.steps() if earlier < step]
+            left = f"from {self.directory / str(before[-1])}" if before else "from the start of the stage"
+            raise ArtifactError(f"{error}; without {path} --resume goes on {left}") from None
+
+
+def _begin(path: Path, arrays: dict[str, np.ndarray], told: dict[str, Any]) -> Callable[[], None]:
+    """Begin to write arrays to the folder `path`, with what else is told of them; return what waits for the end."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    make_room(path.parent, sum(array.nbytes for array in arrays.values()) + len(arrays) * 2**10 + 2**14)
+    sums = {name: _checksum(array) for name, array in arrays.items()}
+    told = {VERSION: _version(), CHECKSUMS: sums, **told}
+    return ocp.save_async(str(path), arrays, overwrite=True, custom_metadata=told).result
+
+
+@contextlib.contextmanager
+def _saving(path: Path, written: Path) -> Iterator[None]:
+    """Tell in one line why `path` cannot be saved, and remove what there is by then of the folder that is written."""
+    try:
+        with writing(path):
+            yield
+    except (ValueError, SaveError) as error:
+        shutil.rmtree(f"{written}{TEMPORARY}", ignore_errors=True)
+        code = re.search(r"os_error_code='(\d+)'", str(error))  # TensorStore's
+        if code is None:
+            raise
+        raise SaveError(f"{path}: cannot be written: {os.strerror(int(code[1]))}") from error
+
+
+def _describe(path: Path) -> tuple[dict[str, Spec], dict[str, Any]]:
+    """Return the shapes and dtypes of the arrays in a folder by dotted name, and what else is told of them."""
+    if not path.exists():
+        raise ArtifactError(f"{path}: expected an artifact, got nothing")
+    with _errors_in_one_line(path):
+        found = ocp.metadata(str(path.absolute()))
+        told = dict(found.custom_metadata or {})
+        if LAYOUT in told:
+            return {name: (tuple(shape), np.dtype(dtype)) for name, dtype, shape in told[LAYOUT]}, told
+        return {name: (meta.shape, meta.dtype) for name, meta in found.metadata.items()}, told
+
+
+def _read(path: Path, told: dict[str, Any]) -> dict[str, np.ndarray]:
+    """Return the arrays in a folder by dotted name, given what is told of them."""
+    with _errors_in_one_line(path):
+        specs = ocp.metadata(str(path.absolute())).metadata
+        empty = {name: np.empty(meta.shape, meta.dtype) for name, meta in specs.items()}
+        arrays = ocp.load(str(path.absolute()), empty)
+        sums = {name: _checksum(array) for name, array in arrays.items()}
+        if sums != told.get(CHECKSUMS, sums):  # earlier versions told none
+            raise ValueError
+        return _unpack(arrays[PACKED], told[LAYOUT]) if LAYOUT in told else arrays
 
 
 @contextlib.contextmanager
 def _errors_in_one_line(path: Path) -> Iterator[None]:
     try:
         yield
-    except (ValueError, OSError, AttributeError):
+    except (ValueError, OSError, AttributeError, KeyError, TypeError):
         raise ArtifactError(f"{path}: expected an artifact, got files of another kind or damaged ones") from None
+
+
+def _pack(arrays: dict[str, np.ndarray]) -> tuple[np.ndarray, list]:
+    """Return the bytes [n] of all arrays, and of what they are, in order: name, dtype and shape."""
+    layout = [[name, array.dtype.name, list(array.shape)] for name, array in arrays.items()]
+    return np.concatenate([_bytes(array) for array in arrays.values()]), layout
+
+
+def _unpack(packed: np.ndarray, layout: list) -> dict[str, np.ndarray]:
+    """Undo `_pack`."""
+    arrays, begin = {}, 0
+    for name, dtype, shape in layout:
+        end = begin + math.prod(shape) * np.dtype(dtype).itemsize
+        arrays[name] = packed[begin:end].copy().view(dtype).reshape(shape)  # copied, to begin at an even address
+        begin = end
+    return arrays
+
+
+def _bytes(array: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(array).reshape(-1).view(np.uint8)
+
+
+def _checksum(array: np.ndarray) -> int:
+    return zlib.crc32(_bytes(array))
+
+
+def _version() -> str:
+    try:
+        return metadata.version("taic_jax")
+    except metadata.PackageNotFoundError:  # a bare checkout
+        return "not installed"
 
 
 def _named(tree: Any) -> dict[str, Any]:
     """Return the leaves by dotted name, in the tree's order."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
     return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
+
+
+def _plain(tree: Any) -> dict[str, np.ndarray]:
+    """Return the leaves by dotted name as NumPy's arrays, without those that have no entries: Orbax has none."""
+    named = {name: leaf for name, leaf in _named(tree).items() if leaf.size}
+    return jax.device_get({name: jax.random.key_data(x) if _is_key(x) else x for name, x in named.items()})
 
 
 def _is_key(leaf: Any) -> bool:
@@ -121,29 +283,18 @@ def _key_impl(leaf: Any) -> Any:
     return jax.random.key_impl(jnp.zeros((), leaf.dtype))  # an abstract leaf has no implementation to ask
 
 
-def _to_plain(leaf: Any) -> np.ndarray:
-    return np.asarray(jax.random.key_data(leaf) if _is_key(leaf) else leaf)
-
-
-def _plain_spec(leaf: Any) -> tuple[tuple[int, ...], np.dtype]:
+def _plain_spec(leaf: Any) -> Spec:
     plain = jax.eval_shape(jax.random.key_data, leaf) if _is_key(leaf) else leaf
     return plain.shape, plain.dtype
 
 
 def _from_plain(array: np.ndarray | None, leaf: Any) -> jax.Array:
-    if array is None:  # Orbax cannot store an array without entries
+    if array is None:  # it has no entries
         return jnp.zeros(leaf.shape, leaf.dtype)
     if _is_key(leaf):
         array = jax.random.wrap_key_data(jnp.asarray(array), impl=_key_impl(leaf))
     return jax.device_put(array, leaf.sharding if getattr(leaf, "committed", False) else None)
 
 
-def _check(path: Path, stored: dict[str, Any], expected: dict[str, Any]) -> None:
-    for name in {**expected, **stored}:
-        want, got = expected.get(name), stored.get(name)
-        if want != got:
-            raise ArtifactError(f"{path}: expected {_show(want)} at {name or 'the root'}, got {_show(got)}")
-
-
-def _show(spec: tuple[tuple[int, ...], np.dtype] | None) -> str:
+def _show(spec: Spec | None) -> str:
     return "nothing" if spec is None else f"{spec[1]}{list(spec[0])}"

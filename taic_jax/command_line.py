@@ -5,6 +5,7 @@ Arguments are parsed and checked before JAX is imported, so that help and mistak
 
 import contextlib
 import dataclasses
+import errno
 import io
 import itertools
 import os
@@ -20,11 +21,12 @@ import tyro
 
 from taic_jax.config import Config, ConfigError, Shard, walk
 from taic_jax.config_io import closest, load_config, mistyped, preset_names
+from taic_jax.files import SaveError
 from taic_jax.interruption import DivergedError, Interrupted, Signals
 from taic_jax.validation import validate
 
 DEFAULT_PRESET = "nav2d"
-FAILED = 1
+FAILED, UNWRITTEN = 1, 74  # 74 is the system's "input/output error"
 EXIT_CODES: dict[int, int] = {signal.SIGINT: 130, signal.SIGTERM: 75}
 
 
@@ -94,7 +96,7 @@ def attempt(work: Callable[[Signals], object], run_dir: Path) -> int:
     """Do the work of a run, which may be told to stop, and return the exit code.
 
     It is 0 at its end; a run that was told to stop and saved what it had done gives 130 after SIGINT (Ctrl-C) and 75,
-    the system's "try again", after SIGTERM; one whose every seed diverged gives 1.
+    the system's "try again", after SIGTERM; one whose every seed diverged gives 1; one that could not write gives 74.
     """
     try:
         with Signals() as signals:
@@ -107,6 +109,13 @@ def attempt(work: Callable[[Signals], object], run_dir: Path) -> int:
     except DivergedError as error:
         print(f"taic_jax: error: {error}", file=sys.stderr)
         return FAILED
+    except OSError as error:
+        if not isinstance(error, SaveError) and error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+            raise
+        told = " ".join(str(error).split())
+        goes_on = f"what was saved is whole: make room, then --resume --run-dir {run_dir} goes on"
+        print(f"taic_jax: error: {told}; {goes_on}", file=sys.stderr)
+        return UNWRITTEN
     return 0
 
 

@@ -5,7 +5,6 @@ iteration it was in, and a resumed one writes the same files again.
 """
 
 import json
-import os
 import zipfile
 from functools import partial
 from pathlib import Path
@@ -16,10 +15,11 @@ import numpy as np
 from jaxtyping import Array, Key
 
 from taic_jax.artifacts import DESCRIPTION, Body, read_description
-from taic_jax.checkpoint import ArtifactError, save_text
+from taic_jax.checkpoint import ArtifactError
 from taic_jax.config import CollectConfig
 from taic_jax.demonstrations import read_demonstrations
 from taic_jax.envs.base import Env
+from taic_jax.files import save_text, whole_file, writing
 from taic_jax.options.dataset import Experience
 from taic_jax.options.execution import IdentityExecutor
 from taic_jax.rl import ppo
@@ -90,17 +90,21 @@ class ExperienceStore:
 
     def __init__(self, folder: Path, capacity: int, description: dict):
         self.folder, self.capacity = folder, capacity
-        folder.mkdir(parents=True, exist_ok=True)
+        with writing(folder):
+            folder.mkdir(parents=True, exist_ok=True)
         save_text(folder / DESCRIPTION, json.dumps(description, indent=2) + "\n")
 
     def write(self, iteration: int, block: Experience) -> None:
-        """Save the block of one iteration, atomically, and drop the block that no longer fits."""
+        """Save the block of one iteration, whole or not at all, and drop the block that no longer fits.
+
+        Raises:
+          SaveError: it cannot be written.
+        """
         path = self.folder / f"{iteration:06d}.npz"
-        temporary = path.with_suffix(".tmp")
-        with temporary.open("wb") as file:
+        with whole_file(path) as file:
             np.savez(file, obs=block.obs, action=block.action, reward=block.reward, done=block.done)
-        os.replace(temporary, path)
-        (self.folder / f"{iteration - self.capacity:06d}.npz").unlink(missing_ok=True)
+        with writing(path):
+            (self.folder / f"{iteration - self.capacity:06d}.npz").unlink(missing_ok=True)
 
 
 def read_experience(folder: Path, seed: int) -> Experience:

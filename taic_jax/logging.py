@@ -14,11 +14,13 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import tensorboardX
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from tensorboardX.proto.event_pb2 import Event  # pyright: ignore[reportAttributeAccessIssue]
+from tensorboardX.record_writer import RecordWriter
+from tensorboardX.summary import histogram_raw, scalar
 
-from taic_jax.checkpoint import save_text
+from taic_jax.files import save_text, writing
 
 Row = dict[str, Any]
 Unit = Literal["ticks", "steps"]
@@ -37,9 +39,11 @@ class RunLogger:
     """
 
     def __init__(self, run_dir: Path, *, quiet: bool = False):
-        run_dir.mkdir(parents=True, exist_ok=True)
         self._path, self._events_dir = run_dir / "metrics.jsonl", run_dir / "tensorboard"
-        _drop_half_row(self._path)
+        with writing(run_dir):
+            self._events_dir.mkdir(parents=True, exist_ok=True)
+        with writing(self._path):
+            _drop_half_row(self._path)
         self._open()
         console = Console(stderr=True)
         self._progress = Progress(
@@ -80,12 +84,18 @@ class RunLogger:
             count: interactions, or gradient steps, so far in this stage, per seed.
             metrics: numbers, or arrays of shape [K] with one number per seed, or [K, L] with how often 1..L occurred.
             unit: what `count` counts, and its name in the row.
+
+        Raises:
+            SaveError: the row cannot be written.
         """
         row: Row = {"stage": stage, unit: count, "time": round(time.time(), 3)}
         row |= {f"{stage}/{name}": _to_json(value) for name, value in metrics.items()}
-        self._file.write(json.dumps(row, allow_nan=False) + "\n")
-        self._file.flush()
+        with writing(self._path):
+            self._file.write(json.dumps(row, allow_nan=False) + "\n")
+            self._file.flush()
         self._write_events(row)
+        with writing(self._events_dir):
+            self._events.flush()
         if self._task is not None:
             self._show(self._task, row, unit)
 
@@ -103,29 +113,43 @@ class RunLogger:
             self._write_events(row)
 
     def _open(self) -> None:
-        self._file = self._path.open("a")
-        self._events = tensorboardX.SummaryWriter(str(self._events_dir))
+        with writing(self._path):
+            self._file = self._path.open("a")
+        with writing(self._events_dir):
+            self._events_dir.mkdir(exist_ok=True)
+            # The writer beneath tensorboardX.SummaryWriter, whose thread would die unheard when the disk is full, and
+            # every row from then on wait for it.
+            self._events = RecordWriter(str(self._events_dir / f"events.out.tfevents.{int(time.time())}"))
+            self._events.write(Event(wall_time=time.time(), file_version="brain.Event:2").SerializeToString())
 
     def _close(self) -> None:
-        self._file.close()
-        self._events.close()
+        try:
+            with writing(self._path):
+                self._file.close()
+        finally:
+            with writing(self._events_dir):
+                self._events.close()
 
     def _write_events(self, row: Row) -> None:
         for name, value in row.items():
             if isinstance(value, list) and value and isinstance(value[0], list):
                 self._write_histogram(name, np.nansum(np.array(value, float), axis=0), row)
             elif "/" in name and (mean := _mean(value)) is not None:
-                self._events.add_scalar(name, mean, _count(row), walltime=row["time"])
+                self._write_event(scalar(name, mean), row)
 
     def _write_histogram(self, name: str, counts: np.ndarray, row: Row) -> None:
         """Write how often each of 1..L occurred."""
         values = np.arange(1, len(counts) + 1)
         total, squares = float(counts @ values), float(counts @ values**2)
-        self._events.add_histogram_raw(
+        summary = histogram_raw(
             name, min=0.5, max=len(counts) + 0.5, num=int(counts.sum()), sum=total, sum_squares=squares,
             bucket_limits=(values + 0.5).tolist(), bucket_counts=counts.tolist(),
-            global_step=_count(row), walltime=row["time"],
         )  # fmt: skip
+        self._write_event(summary, row)
+
+    def _write_event(self, summary: Any, row: Row) -> None:
+        with writing(self._events_dir):
+            self._events.write(Event(wall_time=row["time"], step=_count(row), summary=summary).SerializeToString())
 
     def _show(self, task: TaskID, row: Row, unit: Unit) -> None:
         seconds = max(time.monotonic() - self._started, 1e-9)

@@ -13,13 +13,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from taic_jax.artifacts import OPTIONS, POLICY, describe, load_options, load_policy, save_options, save_policy
-from taic_jax.checkpoint import save_text
 from taic_jax.config import COLLECT, Config, ConfigError, OptionsConfig, Shard, collector_is_baseline, needs_collect
 from taic_jax.devices import make_devices
 from taic_jax.envs import environment_options, make_env
 from taic_jax.envs.base import Env
 from taic_jax.envs.errors import RenderingError
 from taic_jax.experience import EXPERIENCE, ExperienceStore, gather_experience, num_blocks
+from taic_jax.files import save_text
 from taic_jax.guard import FINITE
 from taic_jax.level import FineTunedLevel, Level, Trained
 from taic_jax.logging import RunLogger

@@ -5,9 +5,9 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
-from taic_jax.checkpoint import PARTIAL, save_text
 from taic_jax.config import COLLECT, Config, walk
 from taic_jax.config_io import load_config, to_yaml
+from taic_jax.files import PARTIAL, SaveError, remove_partial, save_text, writing
 
 try:
     import fcntl
@@ -27,7 +27,7 @@ def prepare_folder(config: Config, run_dir: Path, *, resume: bool = False, overw
     """Make the run folder, or check that it is the one to resume.
 
     Raises:
-      RunFolderError: the folder holds another run, or none where one is to be resumed.
+      RunFolderError: the folder holds another run, or none where one is to be resumed, or cannot be written.
     """
     saved, text = run_dir / "config.yaml", to_yaml(config)
     if resume:
@@ -38,34 +38,56 @@ def prepare_folder(config: Config, run_dir: Path, *, resume: bool = False, overw
         if differing:
             raise RunFolderError(f"{run_dir} was run with another config, differing in {differing[:1]}")
         return
-    if run_dir.exists() and (not run_dir.is_dir() or _holds_files(run_dir)):
-        if not overwrite:
-            raise RunFolderError(f"{run_dir} already holds files; add --resume, --overwrite or another --run-dir")
-        if not saved.is_file():
-            raise RunFolderError(f"{run_dir} is not a run's folder (no config.yaml in it), so it is not overwritten")
-        for name in {config.options.source, *config.options.experience} - {"", COLLECT}:
-            if Path(name).resolve().is_relative_to(run_dir.resolve()):
-                raise RunFolderError(f"{run_dir} holds what this run starts from, {name}, so it is not overwritten")
-        with claimed(run_dir):
-            shutil.rmtree(run_dir)
-    run_dir.mkdir(parents=True, exist_ok=True)
-    save_text(saved, text)
+    _make_room(config, run_dir, overwrite)
+    try:
+        with writing(run_dir):
+            run_dir.mkdir(parents=True, exist_ok=True)
+        save_text(saved, text)
+    except SaveError as error:
+        raise RunFolderError(f"{error}; nothing was begun") from None
 
 
 @contextlib.contextmanager
 def claimed(run_dir: Path) -> Iterator[None]:
     """Keep other processes off a run's folder; the system gives it back when this one ends, however it ends.
 
+    What a process that was killed here left half-written is removed.
+
     Raises:
       BusyError: another process is at it.
+      RunFolderError: it cannot be written.
     """
-    with (run_dir / "config.yaml").open() as file:
+    try:
+        file = (run_dir / "config.yaml").open("r+")
+    except OSError as error:
+        raise RunFolderError(f"{run_dir} cannot be written: {error.strerror}") from None
+    with file:
         if fcntl is not None:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 raise BusyError(f"{run_dir} is being written by another process; wait for its end") from None
+        remove_partial(run_dir)
         yield
+
+
+def _make_room(config: Config, run_dir: Path, overwrite: bool) -> None:
+    """Remove the run in a folder, if that was asked for and it is one.
+
+    Raises:
+      RunFolderError: it was not, or is not, or cannot be removed.
+    """
+    if not run_dir.exists() or (run_dir.is_dir() and not _holds_files(run_dir)):
+        return
+    if not overwrite:
+        raise RunFolderError(f"{run_dir} already holds files; add --resume, --overwrite or another --run-dir")
+    if not (run_dir / "config.yaml").is_file():
+        raise RunFolderError(f"{run_dir} is not a run's folder (no config.yaml in it), so it is not overwritten")
+    for name in {config.options.source, *config.options.experience} - {"", COLLECT}:
+        if Path(name).resolve().is_relative_to(run_dir.resolve()):
+            raise RunFolderError(f"{run_dir} holds what this run starts from, {name}, so it is not overwritten")
+    with claimed(run_dir):
+        shutil.rmtree(run_dir)
 
 
 def _holds_files(run_dir: Path) -> bool:

@@ -4,7 +4,7 @@ import json
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -13,9 +13,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from taic_jax.checkpoint import Checkpoints, save_text, save_tree
+from taic_jax.checkpoint import ArtifactError, Checkpoints, save_tree
 from taic_jax.config import Config
 from taic_jax.devices import Devices, take
+from taic_jax.files import save_text
 from taic_jax.guard import FINITE, QUANTITIES, Guarded, begin, guarded
 from taic_jax.interruption import DivergedError, Signals
 from taic_jax.logging import RunLogger
@@ -32,20 +33,31 @@ CLOCK, DUMPS = "clock.json", "dumps"
 
 @dataclass
 class Clock:
-    """Seconds spent compiling and running, and the ticks run in that time."""
+    """Seconds spent compiling and running, and the ticks run in that time, which checkpoints tell on a resume."""
 
     compile: float = 0.0
     run: float = 0.0
     ticks: int = 0
 
-    def save(self, path: Path) -> None:
-        """Write to a JSON file, so that a resumed run counts on."""
-        save_text(path, json.dumps(asdict(self)) + "\n")
+    def stop(self, since: float, path: Path) -> float:
+        """Count what ran since then, write to a JSON file, so that a resumed run counts on, and return the time."""
+        self.run += time.perf_counter() - since
+        save_text(path, json.dumps({"compile": self.compile, "run": self.run}) + "\n")
+        return time.perf_counter()
 
     @classmethod
     def load(cls, path: Path) -> "Clock":
-        """Read what `save` wrote; without a file, start at zero."""
-        return cls(**json.loads(path.read_text())) if path.exists() else cls()
+        """Read what `save` wrote; without a file, start at zero.
+
+        Raises:
+          ArtifactError: it is not such a file.
+        """
+        try:
+            return cls(**json.loads(path.read_text())) if path.exists() else cls()
+        except (ValueError, TypeError):
+            raise ArtifactError(
+                f"{path}: expected the seconds of a run, got another file; without it they start at 0"
+            ) from None
 
 
 class Stopped(NamedTuple):
@@ -148,11 +160,14 @@ def drive(
     Raises:
       Interrupted: a signal was received; the step that was being taken is finished and saved.
       DivergedError: every seed has stopped.
+      SaveError: something cannot be written; the checkpoints before are still there.
     """
     checkpoints = Checkpoints(run.dir / "checkpoints" / stage)
     guard = begin(state, run.inherited(stage))
     first = checkpoints.latest_step() or 0
-    guard = checkpoints.load(first, guard) if first else guard
+    if first:
+        guard = checkpoints.load(first, guard)
+    run.clock.ticks += first * ticks
     run.logger.truncate(stage, first * unit)
     known = run.stop(stage, guard, unit)
     if first == num_steps:
@@ -160,7 +175,7 @@ def drive(
     guard, args = run.devices.place((guard, args))
     compiled = run.compile(guarded(step), guard, *args, donate=True)
     saved = time.perf_counter()
-    with run.logger.stage(stage, num_steps * unit, done=first * unit):
+    with checkpoints.waited_for(), run.logger.stage(stage, num_steps * unit, done=first * unit):
         for index in range(first, num_steps):
             guard, metrics, extra = compiled(guard, *args)
             metrics, codes = jax.device_get(run.rows((metrics, guard.code)))
@@ -174,8 +189,6 @@ def drive(
             due = time.perf_counter() - saved > run.checkpoint_seconds or index + 1 == num_steps
             if due or changed or run.signals.received:
                 checkpoints.save(index + 1, run.rows(guard))
-                run.clock.run += time.perf_counter() - saved
-                run.clock.save(run.dir / CLOCK)
-                saved = time.perf_counter()
+                saved = run.clock.stop(saved, run.dir / CLOCK)
             run.signals.check()
     return run.rows(guard.state)

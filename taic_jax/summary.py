@@ -13,6 +13,7 @@ from taic_jax.config import COLLECT, Config, collector_is_baseline, needs_collec
 from taic_jax.envs.base import Env
 from taic_jax.evaluate import record
 from taic_jax.experience import experience_bytes
+from taic_jax.files import whole_file
 from taic_jax.guard import FINITE, QUANTITIES
 from taic_jax.rl.ppo import Agent, num_iterations
 from taic_jax.stage import Run, Stopped
@@ -122,4 +123,6 @@ def write_video(run: Run, env: Env, agent: Agent) -> None:
         return
     agent = jax.device_get(jax.tree.map(lambda x: x[0], agent))
     physics = jax.jit(lambda agent, key: record(env, agent, key, ticks))(agent, run.stage_keys("video")[0])
-    write_webp(run.dir / "video.webp", env.render(jax.device_get(physics)), env.dt)
+    frames = env.render(jax.device_get(physics))
+    with whole_file(run.dir / "video.webp") as file:
+        write_webp(file, frames, env.dt)

@@ -2,12 +2,13 @@
 
 import ctypes.util
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import beartype
 import hypothesis
 import jax
+import pytest
 
 # A test may import MuJoCo before the package does, which would choose how to draw without a display.
 if "DISPLAY" not in os.environ:
@@ -40,3 +41,12 @@ hypothesis.settings.load_profile("taic_jax")
 def check_functions(function: Callable) -> Callable:
     """Check the types and shapes of a call, but for a dataclass's `__init__`: JAX rebuilds trees with placeholders."""
     return function if function.__name__ == "__init__" else beartype.beartype(function)
+
+
+@pytest.fixture
+def limit() -> Iterator[Callable[[int | None], None]]:
+    """Give a function that lets no file grow beyond so many bytes, as on a disk that is full; None takes it back."""
+    resource = pytest.importorskip("resource")
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    yield lambda size: resource.setrlimit(resource.RLIMIT_FSIZE, (soft if size is None else size, hard))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))

@@ -15,8 +15,9 @@ from probes import Counting, assert_trees_equal
 
 from taic_jax import normalize
 from taic_jax.artifacts import load_options, load_policy, save_options, save_policy
-from taic_jax.checkpoint import TEMPORARY, ArtifactError
+from taic_jax.checkpoint import ArtifactError
 from taic_jax.config import OptionsConfig, PPOConfig
+from taic_jax.files import TEMPORARY
 from taic_jax.options.execution import IdentityExecutor
 from taic_jax.options.model import OptionModel, Scale, init_params, make_networks
 from taic_jax.rl.ppo import Agent, Policy

@@ -79,15 +79,20 @@ def test_a_folder_that_jax_was_told_is_kept():
     assert jax.config.values["jax_compilation_cache_dir"] == before
 
 
-def test_else_it_is_the_users(monkeypatch, tmp_path):
+def test_else_it_is_the_users_without_what_is_half_written(monkeypatch, tmp_path):
     monkeypatch.setattr("platformdirs.user_cache_path", lambda name: tmp_path / name)
     told = {
         name: getattr(jax.config, name) for name in jax.config.values if name.startswith("jax_") and "cache" in name
     }
+    folder = tmp_path / "taic_jax/programs"
+    folder.mkdir(parents=True)
+    for name in ("half-cache", "whole-cache", "whole-atime"):
+        (folder / name).touch()
     try:
         jax.config.update("jax_compilation_cache_dir", None)
         keep_programs()
-        assert jax.config.values["jax_compilation_cache_dir"] == str(tmp_path / "taic_jax/programs")
+        assert jax.config.values["jax_compilation_cache_dir"] == str(folder)
+        assert {path.name for path in folder.iterdir()} == {"whole-cache", "whole-atime"}
     finally:
         for name, value in told.items():
             jax.config.update(name, value)

@@ -8,19 +8,29 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from orbax.checkpoint import v1 as ocp
 from PIL import Image
-from tiny_runs import CONFIG, PPO, KilledError, die, files_of, rows_of, tiny_steps
+from probes import assert_trees_equal
+from tiny_runs import (
+    CONFIG,
+    PPO,
+    KilledError,
+    assert_same_arrays,
+    die,
+    files_of,
+    rows_of,
+    tiny_steps,
+    with_fields,
+)
 
 from taic_jax import pipeline, stage
-from taic_jax.checkpoint import Checkpoints
+from taic_jax.checkpoint import Checkpoints, load_arrays
 from taic_jax.config import Config, ConfigError, TrainConfig
 from taic_jax.config_io import load_config
 from taic_jax.envs import make_env
 from taic_jax.experience import ExperienceStore, read_experience
 from taic_jax.logging import RunLogger
 from taic_jax.options.dataset import Experience
-from taic_jax.pipeline import run_pipeline
+from taic_jax.pipeline import make_envs, over_rows, run_pipeline
 from taic_jax.run_folder import RunFolderError
 from taic_jax.types import as_rows
 
@@ -42,9 +52,18 @@ def finished(tmp_path_factory) -> Path:
 
 
 def last_states(folder: Path) -> dict[str, dict[str, np.ndarray]]:
-    return {name: ocp.load(folder / "checkpoints" / name / str(steps)) for name, steps in STAGES.items()} | {
-        "options": ocp.load(folder / "options")
+    return {name: load_arrays(folder / "checkpoints" / name / str(steps)) for name, steps in STAGES.items()} | {
+        "options": load_arrays(folder / "options")
     }
+
+
+def assert_same_runs(a: Path, b: Path) -> None:
+    states = last_states(b)
+    for name, state in last_states(a).items():
+        assert_same_arrays(state, states[name])
+    assert methods_of(a) == methods_of(b) and rows_of(a) == rows_of(b)
+    blocks = {name for name in files_of(b) if name.startswith("experience") or name == "config.yaml"}
+    assert {name: files_of(a)[name] for name in blocks} == {name: files_of(b)[name] for name in blocks}
 
 
 def methods_of(folder: Path) -> dict:
@@ -127,16 +146,24 @@ def test_an_interrupted_run_ends_as_if_it_had_not_been(finished, tmp_path, monke
             die(patch, *death)
             run_pipeline(CONFIG, folder, resume=i > 0)
     run_pipeline(CONFIG, folder, resume=True)
-    for name, state in last_states(finished).items():
-        resumed = last_states(folder)[name]
-        assert state.keys() == resumed.keys()
-        for leaf in state:
-            np.testing.assert_array_equal(state[leaf], resumed[leaf], err_msg=f"{name}: {leaf}")
-    assert methods_of(folder) == methods_of(finished)
+    assert_same_runs(folder, finished)
     assert json.loads((folder / "summary.json").read_text())["ticks"] == 2 * (48 + 48)
-    assert rows_of(folder) == rows_of(finished)
-    blocks = {name for name in files_of(finished) if name.startswith("experience") or name == "config.yaml"}
-    assert {name: files_of(folder)[name] for name in blocks} == {name: files_of(finished)[name] for name in blocks}
+
+
+def test_a_run_repeated_is_the_same_to_the_last_bit(finished, tmp_path):
+    run_pipeline(CONFIG, tmp_path / "run")
+    assert_same_runs(tmp_path / "run", finished)
+
+
+@pytest.mark.parametrize("stage", ["collect", "flat"])
+def test_a_seed_starts_the_same_alone_among_others_and_in_a_sweep(stage):
+    point = with_fields(CONFIG, train__ppo__learning_rate=0.01)
+    env, _ = make_envs(CONFIG)
+    init = jax.jit(over_rows(env, stage, "init"))
+    keys = jax.vmap(jax.random.key)(jnp.arange(4))
+    alone = init(as_rows([CONFIG], 1), keys[3:])
+    for row, many in ((3, init(as_rows([CONFIG], 4), keys)), (7, init(as_rows([point, CONFIG], 4), jnp.tile(keys, 2)))):
+        assert_trees_equal(alone, jax.tree.map(lambda x, row=row: x[row : row + 1], many))
 
 
 def test_a_seed_does_not_depend_on_how_many_run(finished, tmp_path):

@@ -6,10 +6,10 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from orbax.checkpoint import v1 as ocp
 from tiny_runs import CONFIG, files_of, last_state, tiny_steps, with_fields
 
 from taic_jax.artifacts import describe
+from taic_jax.checkpoint import load_arrays
 from taic_jax.config import Config
 from taic_jax.config_io import to_yaml
 from taic_jax.envs import make_env
@@ -62,7 +62,7 @@ def make_demonstrations(path: str, ticks: int, first: float) -> None:
 
 
 def options() -> dict[str, np.ndarray]:
-    return ocp.load(Path("new/options").absolute())
+    return load_arrays(Path("new/options"))
 
 
 def mean_states() -> list[float]:

@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from orbax.checkpoint import v1 as ocp
 from tiny_runs import (
     CONFIG,
     KilledError,
@@ -21,7 +20,7 @@ from tiny_runs import (
 )
 
 from taic_jax import guard, pipeline
-from taic_jax.checkpoint import Checkpoints
+from taic_jax.checkpoint import Checkpoints, load_arrays
 from taic_jax.config import Config, ConfigError, collector_is_baseline, needs_collect
 from taic_jax.pipeline import make_envs, run_pipeline
 from taic_jax.stage import STAGES
@@ -87,7 +86,7 @@ def test_frozen_options_are_what_acts_and_stay_as_they_are(source, transferred, 
     monkeypatch.setattr(pipeline, "train_over_options", lambda *args: agents.append(train(*args)) or agents[-1])
     run_pipeline(using(source / "options", seeds=3, train__baselines=()), tmp_path / "run")
     assert files_of(source) == before
-    stored = ocp.load(source / "options")
+    stored = load_arrays(source / "options")
     acting = jax.tree_util.tree_flatten_with_path(agents[0].agent.executor.model)[0]
     named = {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in acting}
     assert_same_arrays(named, {name: array[[0, 1, 0]] for name, array in stored.items()})
@@ -111,7 +110,7 @@ def test_the_transferred_policy_starts_where_the_source_run_ended(source, transf
     with pipeline.RunLogger(transferred.with_name("unused")) as logger:
         run = pipeline.Run(pipeline.as_rows([config], 2), keys, transferred, logger, pipeline.Clock())
         pipeline.train_baseline(run, env, "transfer", policy)
-    saved, (start,) = ocp.load(source / "policy"), states
+    saved, (start,) = load_arrays(source / "policy"), states
     first, second = (saved[f"0.actor.params.Dense_{i}.kernel"] for i in range(2))
     np.testing.assert_array_equal(start.params.actor["params"]["Dense_0"]["kernel"], first[:, :2])
     np.testing.assert_array_equal(start.params.actor["params"]["Dense_1"]["kernel"], second)

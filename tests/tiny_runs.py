@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from orbax.checkpoint import v1 as ocp
 
 from taic_jax import pipeline, stage
+from taic_jax.checkpoint import Checkpoints, load_arrays
 from taic_jax.config import CollectConfig, Config, EvaluateConfig, OptionsConfig, PPOConfig, TrainConfig
 from taic_jax.logging import read_metrics
 
@@ -88,8 +88,8 @@ def rows_of(folder: Path) -> list[dict]:
 
 def last_state(folder: Path, stage: str) -> dict[str, np.ndarray]:
     """Return the last checkpoint of a stage, array by array."""
-    steps = max(int(path.name) for path in (folder / "checkpoints" / stage).iterdir())
-    return ocp.load(folder / "checkpoints" / stage / str(steps))
+    checkpoints = Checkpoints(folder / "checkpoints" / stage)
+    return load_arrays(checkpoints.directory / str(checkpoints.latest_step()))
 
 
 def assert_same_arrays(a: dict[str, np.ndarray], b: dict[str, np.ndarray]) -> None:

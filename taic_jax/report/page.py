@@ -10,7 +10,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from taic_jax.checkpoint import save_text
+from taic_jax.files import save_text
 from taic_jax.report.curves import stage_curves
 from taic_jax.report.option_plots import option_plot
 from taic_jax.report.results import facts_of, histograms_of, methods_of

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from taic_jax.files import whole_file
 from taic_jax.sweep.axes import Axis
 
 
@@ -22,7 +23,8 @@ def draw_marginals(
         _draw(panel, axis, values, np.array(list(scores.values()), float))
         panel.set_xlabel(axis.name)
     panels[0].set_ylabel("return, interquartile mean")
-    figure.savefig(path, dpi=120)
+    with whole_file(path) as file:
+        figure.savefig(file, format="png", dpi=120)
 
 
 def _draw(panel: Any, axis: Axis, values: list[Any], scores: np.ndarray) -> None:

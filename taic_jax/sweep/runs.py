@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from taic_jax.checkpoint import save_text
 from taic_jax.config import Config, replace
 from taic_jax.config_io import to_yaml
 from taic_jax.experience import EXPERIENCE
+from taic_jax.files import save_text
 from taic_jax.interruption import DivergedError
 from taic_jax.logging import read_metrics
 from taic_jax.pipeline import run_pipeline
@@ -198,11 +198,13 @@ def _batches(
 
 
 def _resumed(plan: Plan, run_dir: Path) -> Plan:
-    """Return the plan of the sweep in the folder.
+    """Return the plan of the sweep in the folder; if it was killed before it wrote that, the one that is asked for.
 
     Raises:
       RunFolderError: there is none, or it is of other axes.
     """
+    if {path.name for path in run_dir.iterdir()} == {"config.yaml"}:
+        return plan
     try:
         saved = Plan(**json.loads((run_dir / PLAN).read_text()))
     except (OSError, ValueError, TypeError):

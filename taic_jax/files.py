@@ -1,0 +1,84 @@
+"""Files that appear under their name when they are whole, and not before, and what is told where that fails."""
+
+import contextlib
+import os
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+PARTIAL = ".partial"
+"""Ending of a file that is not whole yet."""
+TEMPORARY = ".orbax-checkpoint-tmp"  # Orbax writes a folder under this suffix, and renames when all is written
+
+
+class SaveError(OSError):
+    """A file could not be written: the disk is full, or may not be written to."""
+
+
+@contextlib.contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Tell in one line what keeps `path` from being written.
+
+    Raises:
+        SaveError: something does.
+    """
+    try:
+        yield
+    except SaveError:
+        raise
+    except OSError as error:
+        raise SaveError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+@contextlib.contextmanager
+def whole_file(path: Path) -> Iterator[BinaryIO]:
+    """Give a file to write, that takes the place of `path` once it is whole, and is removed if it does not get there.
+
+    Raises:
+        SaveError: it cannot be written.
+    """
+    partial = path.with_name(path.name + PARTIAL)
+    with writing(path):
+        try:
+            with partial.open("wb") as file:
+                yield file
+            os.replace(partial, path)
+        except BaseException:
+            with contextlib.suppress(OSError):  # what went wrong first is what is told
+                partial.unlink(missing_ok=True)
+            raise
+
+
+def save_text(path: Path, text: str) -> None:
+    """Write a text file, whole or not at all, in place of what was there.
+
+    Raises:
+        SaveError: it cannot be written.
+    """
+    with whole_file(path) as file:
+        file.write(text.encode())
+
+
+def make_room(folder: Path, size: int) -> None:
+    """Check that so many bytes can be written in a folder.
+
+    Raises:
+        OSError: they cannot.
+    """
+    partial = folder / f"room{PARTIAL}"
+    try:
+        partial.write_bytes(bytes(size))
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def remove_partial(folder: Path) -> None:
+    """Remove what processes that were killed while they wrote have left anywhere in a folder.
+
+    Raises:
+        SaveError: something cannot be removed.
+    """
+    with writing(folder):
+        for path in [*folder.rglob(f"*{PARTIAL}"), *folder.rglob(f"*{TEMPORARY}")]:
+            shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
