@@ -109,7 +109,7 @@ def flip(path: Path) -> None:
 
 
 @pytest.mark.parametrize("damage", [truncate, flip])
-def test_missing_foreign_and_damaged_artifacts_are_refused(tmp_path, capfd, damage):
+def test_missing_foreign_and_damaged_artifacts_are_refused(tmp_path, caplog, damage):
     tree = {"x": jax.random.normal(jax.random.key(0), 1000)}
     (tmp_path / "empty").mkdir()
     (tmp_path / "file").write_text("not a tree")
@@ -124,7 +124,7 @@ def test_missing_foreign_and_damaged_artifacts_are_refused(tmp_path, capfd, dama
         with pytest.raises(ArtifactError, match=f"{name}: expected an artifact") as error:
             load_tree(tmp_path / name, tree)
         assert "\n" not in str(error.value)
-    assert capfd.readouterr() == ("", "")
+    assert not caplog.records
 
 
 def test_checkpoints_keep_the_latest(tmp_path):
@@ -240,7 +240,7 @@ def test_what_cannot_be_written_leaves_what_was_there(tmp_path, limit, capfd):
     assert capfd.readouterr() == ("", "")
 
 
-def test_a_disk_that_fills_while_orbax_writes_is_told_when_it_is_waited_for(tmp_path, limit, capfd, monkeypatch):
+def test_a_disk_that_fills_while_orbax_writes_is_told_when_it_is_waited_for(tmp_path, limit, caplog, monkeypatch):
     monkeypatch.setattr(checkpoint, "make_room", lambda path, size: None)
     checkpoints, tree = Checkpoints(tmp_path), {"x": np.arange(100_000.0)}
     limit(200)
@@ -250,8 +250,8 @@ def test_a_disk_that_fills_while_orbax_writes_is_told_when_it_is_waited_for(tmp_
         checkpoints.save(2, tree)
         raise SaveError("the first")
     limit(None)
-    assert checkpoints.steps() == []
+    assert not list(tmp_path.iterdir())
     checkpoints.save(2, tree)
     checkpoints.wait()
     assert checkpoints.steps() == [2]
-    assert capfd.readouterr() == ("", "")
+    assert not caplog.records
