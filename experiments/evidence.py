@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import tyro
 
+from taic_jax.checkpoint import ArtifactError
 from taic_jax.compilation import keep_programs
 from taic_jax.config import ConfigError, Shard
 from taic_jax.devices import Devices, make_devices, open_devices
@@ -25,7 +26,7 @@ from taic_jax.experiments.cells import PATHS, Cell, all_cells
 from taic_jax.experiments.option_paths import paths_of
 from taic_jax.experiments.spaces import measure_spaces
 from taic_jax.experiments.table import TABLE, TableError, append_row, read_table, row_of
-from taic_jax.files import save_text
+from taic_jax.files import SaveError, save_text
 from taic_jax.logging import RunLogger
 from taic_jax.pipeline import collect, make_envs, run_pipeline, train_baseline
 from taic_jax.run_folder import RunFolderError, claimed, prepare_folder
@@ -141,7 +142,7 @@ def main(args: Sequence[str] | None = None) -> None:
             for method, stage in cell.stages.items():
                 if (cell.config.env.name, method, cell.config.seed) not in known:
                     append_row(arguments.table, make_row(cell, arguments.run_dir, method, stage))
-    except (ConfigError, RunFolderError, TableError) as error:
+    except (ArtifactError, ConfigError, RunFolderError, SaveError, TableError) as error:
         print(f"evidence: {error}", file=sys.stderr)
         raise SystemExit(2) from None
 

@@ -206,7 +206,7 @@ def _describe(path: Path) -> tuple[dict[str, Spec], dict[str, Any]]:
         raise ArtifactError(f"{path}: expected an artifact, got nothing")
     with _errors_in_one_line(path):
         found = ocp.metadata(str(path.absolute()))
-        told = dict(found.custom_metadata or {})
+        told: Any = found.custom_metadata or {}
         if LAYOUT in told:
             return {name: (tuple(shape), np.dtype(dtype)) for name, dtype, shape in told[LAYOUT]}, told
         return {name: (meta.shape, meta.dtype) for name, meta in found.metadata.items()}, told
@@ -253,7 +253,7 @@ def _bytes(array: np.ndarray) -> np.ndarray:
 
 
 def _checksum(array: np.ndarray) -> int:
-    return zlib.crc32(_bytes(array))
+    return zlib.crc32(_bytes(array).data)
 
 
 def _version() -> str:

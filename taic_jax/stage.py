@@ -165,8 +165,7 @@ def drive(
     checkpoints = Checkpoints(run.dir / "checkpoints" / stage)
     guard = begin(state, run.inherited(stage))
     first = checkpoints.latest_step() or 0
-    if first:
-        guard = checkpoints.load(first, guard)
+    guard = checkpoints.load(first, guard) if first else guard
     run.clock.ticks += first * ticks
     run.logger.truncate(stage, first * unit)
     known = run.stop(stage, guard, unit)
