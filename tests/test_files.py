@@ -1,6 +1,7 @@
 """A run that cannot write ends in one line, loses nothing that was saved, and goes on when it can."""
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -34,11 +35,12 @@ def in_folder_with_config(tmp_path, monkeypatch):
     Path("config.yaml").write_text(to_yaml(CONFIG))
 
 
-# The disk is full from so many calls of a function on, and what is told then.
+# The disk is full from so many calls of a function on, and what is told then. A checkpoint is written while the next
+# iteration is done, so it may be the one before that is told, and is lost.
 FULL = {
-    "checkpoint": (Checkpoints, "save", 2, "checkpoints/collect/2"),
+    "checkpoint": (Checkpoints, "save", 3, "checkpoints/collect/[23]"),
     "metrics": (RunLogger, "log", 5, "metrics.jsonl"),
-    "events": (RunLogger, "_write_events", 2, "tensorboard"),
+    "events": (RunLogger, "_write_events", 3, "tensorboard"),
     "artifact": (pipeline, "save_policy", 1, "policy"),
     "summary": (pipeline, "as_summary", 1, "summary.json"),
 }
@@ -52,7 +54,7 @@ def test_a_full_disk_ends_the_run_in_one_line_and_it_goes_on(whole, monkeypatch,
         assert main(["config.yaml", "--run-dir", "run", "--checkpoint-seconds", "0"]) == 74
     limit(None)
     (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith(f"taic_jax: error: run/{told}: cannot be written: File too large;")
+    assert re.match(rf"taic_jax: error: (/.*/)?run/{told}: cannot be written: File too large;", line), line
     assert line.endswith("--resume --run-dir run goes on")
     assert Checkpoints(Path("run/checkpoints/collect")).steps() and no_leftovers(Path("run"))
     assert main(["--run-dir", "run", "--resume"]) == 0

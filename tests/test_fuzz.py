@@ -92,7 +92,7 @@ def names(told: str, what: str) -> bool:
 
 def leaves(document: Any, prefix: str = "") -> Iterator[str]:
     """Yield the dotted name of every value of a document that should be no mapping, or is none, or an empty one."""
-    if prefix[:-1] in FIELDS or not isinstance(document, dict) or not document:
+    if prefix[:-1] in (*FIELDS, "base") or not isinstance(document, dict) or not document:
         yield prefix[:-1]
         return
     for key, value in document.items():

@@ -7,7 +7,7 @@ import pytest
 from taic_jax.experiments import kills
 
 
-@pytest.mark.timeout(600)
+@pytest.mark.timeout(1200)
 def test_five_killed_runs_end_as_if_they_had_not_been(monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["kills", "--kills", "5", "--iterations", "4", "--seeds", "1", "--jobs", "2"])
     assert kills.main() == 0
