@@ -23,7 +23,8 @@ import jax.numpy as jnp
 import numpy as np
 from orbax.checkpoint import v1 as ocp
 
-from taic_jax.files import PARTIAL, TEMPORARY, SaveError, make_room, writing
+from taic_jax.devices import agree
+from taic_jax.files import PARTIAL, TEMPORARY, SaveError, make_room, writes_here, writing
 
 Tree = TypeVar("Tree")
 Spec = tuple[tuple[int, ...], np.dtype]
@@ -49,9 +50,11 @@ def save_tree(path: Path, tree: Any) -> None:
     partial = path.with_name(path.name + PARTIAL)  # Orbax would remove what is there before it writes
     with _saving(path, partial):
         _begin(partial, _plain(tree), {})()
-        if path.exists():
-            shutil.rmtree(path)
-        partial.rename(path)
+        if writes_here():
+            if path.exists():
+                shutil.rmtree(path)
+            partial.rename(path)
+    agree([0])  # no host goes on before it is there
 
 
 def load_arrays(path: Path) -> dict[str, np.ndarray]:
@@ -158,6 +161,8 @@ class Checkpoints:
         self.wait()
 
     def _drop(self) -> None:
+        if not writes_here():
+            return
         with writing(self.directory):
             for old in self.steps()[: -self.keep]:
                 shutil.rmtree(self.directory / str(old))
@@ -180,7 +185,8 @@ class Checkpoints:
 def _begin(path: Path, arrays: dict[str, np.ndarray], told: dict[str, Any]) -> Callable[[], None]:
     """Begin to write arrays to the folder `path`, with what else is told of them; return what waits for the end."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    make_room(path.parent, sum(array.nbytes for array in arrays.values()) + len(arrays) * 2**10 + 2**14)
+    if writes_here():
+        make_room(path.parent, sum(array.nbytes for array in arrays.values()) + len(arrays) * 2**10 + 2**14)
     sums = {name: _checksum(array) for name, array in arrays.items()}
     told = {VERSION: _version(), CHECKSUMS: sums, **told}
     return ocp.save_async(str(path), arrays, overwrite=True, custom_metadata=told).result

@@ -1,6 +1,7 @@
 """Files that appear under their name when they are whole, and not before, and what is told where that fails."""
 
 import contextlib
+import io
 import os
 import shutil
 from collections.abc import Iterator
@@ -31,13 +32,25 @@ def writing(path: Path) -> Iterator[None]:
         raise SaveError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
+def writes_here() -> bool:
+    """Return whether this host writes what a run keeps: of several hosts of one run, the first does."""
+    import jax  # the command lines answer without it
+
+    return not jax.distributed.is_initialized() or jax.process_index() == 0
+
+
 @contextlib.contextmanager
 def whole_file(path: Path) -> Iterator[BinaryIO]:
     """Give a file to write, that takes the place of `path` once it is whole, and is removed if it does not get there.
 
+    On a host that does not write, it goes nowhere.
+
     Raises:
         SaveError: it cannot be written.
     """
+    if not writes_here():
+        yield io.BytesIO()
+        return
     partial = path.with_name(path.name + PARTIAL)
     with writing(path):
         try:

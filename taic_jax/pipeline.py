@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import sys
+import tempfile
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -19,7 +20,7 @@ from taic_jax.envs import environment_options, make_env
 from taic_jax.envs.base import Env
 from taic_jax.envs.errors import RenderingError
 from taic_jax.experience import EXPERIENCE, ExperienceStore, gather_experience, num_blocks
-from taic_jax.files import save_text
+from taic_jax.files import save_text, writes_here
 from taic_jax.guard import FINITE
 from taic_jax.level import FineTunedLevel, Level, Trained
 from taic_jax.logging import RunLogger
@@ -73,7 +74,9 @@ def run_pipeline(
     # Seed k of a run is seed 0 of a run whose seed is k more.
     keys = jnp.stack([jax.random.key(config.seed + k) for _ in points for k in range(config.seeds)])
     model, policy = _for_points((model, policy), len(points))
-    with claimed(run_dir), RunLogger(run_dir) as logger:
+    elsewhere = tempfile.TemporaryDirectory()  # of several hosts, the logs of all but the first
+    log_dir = run_dir if writes_here() else Path(elsewhere.name)
+    with elsewhere, claimed(run_dir), RunLogger(log_dir) as logger:
         clock = Clock.load(run_dir / CLOCK)
         run = Run(as_rows(points, config.seeds), keys, run_dir, logger, clock, devices=devices, **settings)
         logger.truncate("evaluate", -1)

@@ -1,5 +1,6 @@
 """The command line: `python -m taic_jax.run [CONFIG] [--run-dir DIR] [--section.field value ...]`."""
 
+import re
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,6 +11,7 @@ import tyro
 
 from taic_jax import command_line
 from taic_jax.command_line import FAILED, answer, attempt
+from taic_jax.config import ConfigError
 from taic_jax.config_io import to_yaml
 
 PROGRAM = "python -m taic_jax.run"
@@ -21,6 +23,12 @@ class Command(command_line.Command):
 
     replay: Annotated[Path | None, tyro.conf.arg(metavar="DUMP")] = None
     """Take the step again at which a seed stopped, from the state that the run left under dumps, and stop."""
+    hosts: int = 1
+    """Hosts of one run; each runs this command, all with the same folder, which the first writes."""
+    host: int = 0
+    """Which of the hosts this is."""
+    coordinator: Annotated[str, tyro.conf.arg(metavar="HOST:PORT")] = ""
+    """Where the other hosts reach the first one: any free port of it."""
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -34,7 +42,16 @@ def parse(args: Sequence[str]) -> Command:
     Raises:
       ConfigError: an argument, the named preset or file, or a value is not valid.
     """
-    return command_line.parse(args, PROGRAM, Command)
+    command = command_line.parse(args, PROGRAM, Command)
+    if command.hosts < 1:
+        raise ConfigError(f"--hosts: expected at least 1, got {command.hosts}")
+    if not 0 <= command.host < command.hosts:
+        raise ConfigError(f"--host: expected 0 to {command.hosts - 1}, got {command.host}")
+    if command.hosts > 1 and command.run_dir is None:
+        raise ConfigError("--hosts: expected --run-dir DIR too, a folder that every host sees")
+    if command.hosts > 1 and not re.fullmatch(r".+:\d{1,5}", command.coordinator):
+        raise ConfigError(f"--coordinator: expected HOST:PORT of the first host, got {command.coordinator!r}")
+    return command
 
 
 def execute(command: Command) -> int:
@@ -46,7 +63,7 @@ def execute(command: Command) -> int:
         print(found or f"{command.replay}: all numbers were finite this time")
         return 0 if found else FAILED
     from taic_jax.compilation import keep_programs
-    from taic_jax.devices import open_devices
+    from taic_jax.devices import Hosts, open_devices
     from taic_jax.pipeline import make_envs, run_pipeline
     from taic_jax.summary import plan
 
@@ -55,7 +72,8 @@ def execute(command: Command) -> int:
         print(plan(command.config, *make_envs(command.config)))
         return 0
     keep_programs()
-    shard = open_devices(command.shard, command.config.seeds)
+    hosts = Hosts(command.coordinator, command.hosts, command.host)
+    shard = open_devices(command.shard, command.config.seeds, hosts)
     run_dir = command.folder
     code = attempt(
         lambda signals: run_pipeline(

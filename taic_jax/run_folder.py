@@ -7,7 +7,8 @@ from pathlib import Path
 
 from taic_jax.config import COLLECT, Config, walk
 from taic_jax.config_io import load_config, to_yaml
-from taic_jax.files import PARTIAL, SaveError, remove_partial, save_text, writing
+from taic_jax.devices import agree
+from taic_jax.files import PARTIAL, SaveError, remove_partial, save_text, writes_here, writing
 
 try:
     import fcntl
@@ -24,11 +25,22 @@ class BusyError(RunFolderError):
 
 
 def prepare_folder(config: Config, run_dir: Path, *, resume: bool = False, overwrite: bool = False) -> None:
-    """Make the run folder, or check that it is the one to resume.
+    """Make the run folder, or check that it is the one to resume; of several hosts, the first does, and all hear of it.
 
     Raises:
       RunFolderError: the folder holds another run, or none where one is to be resumed, or cannot be written.
     """
+    refused = None
+    if writes_here():
+        try:
+            _prepare(config, run_dir, resume, overwrite)
+        except RunFolderError as error:
+            refused = error
+    if any(agree([refused is not None])):
+        raise refused or RunFolderError(f"{run_dir} cannot be used, as the first host tells")
+
+
+def _prepare(config: Config, run_dir: Path, resume: bool, overwrite: bool) -> None:
     saved, text = run_dir / "config.yaml", to_yaml(config)
     if resume:
         if not saved.is_file():
@@ -57,6 +69,9 @@ def claimed(run_dir: Path) -> Iterator[None]:
       BusyError: another process is at it.
       RunFolderError: it cannot be written.
     """
+    if not writes_here():
+        yield
+        return
     try:
         file = (run_dir / "config.yaml").open("r+")
     except OSError as error:

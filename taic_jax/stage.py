@@ -15,10 +15,10 @@ import numpy as np
 
 from taic_jax.checkpoint import ArtifactError, Checkpoints, save_tree
 from taic_jax.config import Config
-from taic_jax.devices import Devices, take
+from taic_jax.devices import Devices, agree
 from taic_jax.files import save_text
 from taic_jax.guard import FINITE, QUANTITIES, Guarded, begin, guarded
-from taic_jax.interruption import DivergedError, Signals
+from taic_jax.interruption import DivergedError, Interrupted, Signals
 from taic_jax.logging import RunLogger
 from taic_jax.population import Members, Population
 
@@ -88,7 +88,7 @@ class Run:
 
     def rows(self, tree: S) -> S:
         """Return the rows of the run's own seeds and points, of those that the devices had."""
-        return take(tree, len(self.keys))
+        return self.devices.take(tree, len(self.keys))
 
     def inherited(self, stage: str) -> jax.Array:
         """Return the codes [K] of the seeds that stopped in what this stage builds on."""
@@ -164,7 +164,7 @@ def drive(
     """
     checkpoints = Checkpoints(run.dir / "checkpoints" / stage)
     guard = begin(state, run.inherited(stage))
-    first = checkpoints.latest_step() or 0
+    (first,) = agree([checkpoints.latest_step() or 0], least=True)
     guard = checkpoints.load(first, guard) if first else guard
     run.clock.ticks += first * ticks
     run.logger.truncate(stage, first * unit)
@@ -182,12 +182,14 @@ def drive(
             if after is not None:
                 after(index, run.rows(extra))
             run.clock.ticks += ticks
-            changed = (codes != known).any()
-            if changed:
+            if changed := (codes != known).any():
                 known = run.stop(stage, run.rows(guard), unit, known)
-            due = time.perf_counter() - saved > run.checkpoint_seconds or index + 1 == num_steps
-            if due or changed or run.signals.received:
+            due = changed or index + 1 == num_steps or time.perf_counter() - saved > run.checkpoint_seconds
+            due, received = agree([due, run.signals.received or 0])
+            if due or received:
                 checkpoints.save(index + 1, run.rows(guard))
                 saved = run.clock.stop(saved, run.dir / CLOCK)
-            run.signals.check()
+            if received:
+                raise Interrupted(received)
+    agree([0])  # no host reads what `after` writes before it is there
     return run.rows(guard.state)

@@ -13,7 +13,7 @@ from tiny_runs import CONFIG, SLOPE, KilledError, die, last_state, rows_of, tiny
 
 from taic_jax.checkpoint import Checkpoints
 from taic_jax.config_io import to_yaml
-from taic_jax.devices import Devices, over_envs, take
+from taic_jax.devices import Devices, over_envs
 from taic_jax.envs import PhysicsState, make_env
 from taic_jax.envs.physics.mujoco import num_physical_cores
 from taic_jax.run import main
@@ -105,7 +105,7 @@ def test_each_device_calls_the_engine_with_its_part(shard, monkeypatch):
     for devices in (Devices(), Devices(shard)):
         args = devices.place((state, controls))
         split = jax.vmap(lambda state, controls: over_envs(scan, 4)(state, controls))
-        results.append(take(devices.compile(split, *args)(*args), 2))
+        results.append(devices.take(devices.compile(split, *args)(*args), 2))
     jax.tree.map(np.testing.assert_array_equal, *results)
     whole, parts = sizes[:3], sizes[3:]
     assert len(parts) == 6 and sum(parts) == sum(whole) and set(parts) == {whole[0] // 2}
