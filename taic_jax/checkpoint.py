@@ -8,26 +8,23 @@ and shapes are told in its metadata, and so are checksums, and the version of th
 
 import contextlib
 import logging
-import math
 import os
 import re
 import shutil
-import zlib
 from collections.abc import Callable, Iterator
 from importlib import metadata
 from pathlib import Path
 from typing import Any, TypeVar
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from orbax.checkpoint import v1 as ocp
 
-from taic_jax.devices import agree
 from taic_jax.files import PARTIAL, TEMPORARY, SaveError, make_room, writes_here, writing
+from taic_jax.flat_tree import Spec, by_name, checksum, from_plain, pack, plain, plain_spec, unpack
+from taic_jax.hosts import agree
 
 Tree = TypeVar("Tree")
-Spec = tuple[tuple[int, ...], np.dtype]
 
 VERSION, CHECKSUMS, LAYOUT = "taic_jax", "crc32", "layout"  # keys of what is told beside the arrays
 PACKED = "bytes"  # the one array of a checkpoint
@@ -49,7 +46,7 @@ def save_tree(path: Path, tree: Any) -> None:
     path = path.absolute()
     partial = path.with_name(path.name + PARTIAL)  # Orbax would remove what is there before it writes
     with _saving(path, partial):
-        _begin(partial, _plain(tree), {})()
+        _begin(partial, plain(tree), {})()
         if writes_here():
             if path.exists():
                 shutil.rmtree(path)
@@ -76,9 +73,9 @@ def load_tree(path: Path, like: Tree) -> Tree:
     Raises:
         ArtifactError: nothing is there, or it is not a tree like this one, or it is damaged.
     """
-    named = _named(like)
+    named = by_name(like)
     stored, told = _describe(path)
-    expected = {name: _plain_spec(leaf) for name, leaf in named.items() if leaf.size}
+    expected = {name: plain_spec(leaf) for name, leaf in named.items() if leaf.size}
     for name in {**expected, **stored}:
         want, got = expected.get(name), stored.get(name)
         if want != got:
@@ -86,7 +83,7 @@ def load_tree(path: Path, like: Tree) -> Tree:
             by = "" if writer == _version() else f"; taic_jax {writer} wrote it, this is {_version()}"
             raise ArtifactError(f"{path}: expected {_show(want)} at {name or 'the root'}, got {_show(got)}{by}")
     arrays = _read(path, told)
-    leaves = [_from_plain(arrays.get(name), leaf) for name, leaf in named.items()]
+    leaves = [from_plain(arrays.get(name), leaf) for name, leaf in named.items()]
     return jax.tree.unflatten(jax.tree.structure(like), leaves)
 
 
@@ -124,7 +121,7 @@ class Checkpoints:
         """
         self.wait()
         path = self.directory / str(step)
-        packed, layout = _pack(_plain(tree))
+        packed, layout = pack(plain(tree))
         options = ocp.options.ArrayOptions(saving=ocp.options.ArrayOptions.Saving(use_ocdbt=False))  # for many arrays
         with _saving(path, path), ocp.Context(array_options=options):
             self._pending = path, _begin(path, {PACKED: packed}, {LAYOUT: layout})
@@ -187,7 +184,7 @@ def _begin(path: Path, arrays: dict[str, np.ndarray], told: dict[str, Any]) -> C
     path.parent.mkdir(parents=True, exist_ok=True)
     if writes_here():
         make_room(path.parent, sum(array.nbytes for array in arrays.values()) + len(arrays) * 2**10 + 2**14)
-    sums = {name: _checksum(array) for name, array in arrays.items()}
+    sums = {name: checksum(array) for name, array in arrays.items()}
     told = {VERSION: _version(), CHECKSUMS: sums, **told}
     return ocp.save_async(str(path), arrays, overwrite=True, custom_metadata=told).result
 
@@ -224,10 +221,10 @@ def _read(path: Path, told: dict[str, Any]) -> dict[str, np.ndarray]:
         specs = ocp.metadata(str(path.absolute())).metadata
         empty = {name: np.empty(meta.shape, meta.dtype) for name, meta in specs.items()}
         arrays = ocp.load(str(path.absolute()), empty)
-        sums = {name: _checksum(array) for name, array in arrays.items()}
+        sums = {name: checksum(array) for name, array in arrays.items()}
         if sums != told.get(CHECKSUMS, sums):  # earlier versions told none
             raise ValueError
-        return _unpack(arrays[PACKED], told[LAYOUT]) if LAYOUT in told else arrays
+        return unpack(arrays[PACKED], told[LAYOUT]) if LAYOUT in told else arrays
 
 
 @contextlib.contextmanager
@@ -238,68 +235,11 @@ def _errors_in_one_line(path: Path) -> Iterator[None]:
         raise ArtifactError(f"{path}: expected an artifact, got files of another kind or damaged ones") from None
 
 
-def _pack(arrays: dict[str, np.ndarray]) -> tuple[np.ndarray, list]:
-    """Return the bytes [n] of all arrays, and of what they are, in order: name, dtype and shape."""
-    layout = [[name, array.dtype.name, list(array.shape)] for name, array in arrays.items()]
-    return np.concatenate([_bytes(array) for array in arrays.values()]), layout
-
-
-def _unpack(packed: np.ndarray, layout: list) -> dict[str, np.ndarray]:
-    """Undo `_pack`."""
-    arrays, begin = {}, 0
-    for name, dtype, shape in layout:
-        end = begin + math.prod(shape) * np.dtype(dtype).itemsize
-        arrays[name] = packed[begin:end].copy().view(dtype).reshape(shape)  # copied, to begin at an even address
-        begin = end
-    return arrays
-
-
-def _bytes(array: np.ndarray) -> np.ndarray:
-    return np.ascontiguousarray(array).reshape(-1).view(np.uint8)
-
-
-def _checksum(array: np.ndarray) -> int:
-    return zlib.crc32(_bytes(array).data)
-
-
 def _version() -> str:
     try:
         return metadata.version("taic_jax")
     except metadata.PackageNotFoundError:  # a bare checkout
         return "not installed"
-
-
-def _named(tree: Any) -> dict[str, Any]:
-    """Return the leaves by dotted name, in the tree's order."""
-    leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
-    return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
-
-
-def _plain(tree: Any) -> dict[str, np.ndarray]:
-    """Return the leaves by dotted name as NumPy's arrays, without those that have no entries: Orbax has none."""
-    named = {name: leaf for name, leaf in _named(tree).items() if leaf.size}
-    return jax.device_get({name: jax.random.key_data(x) if _is_key(x) else x for name, x in named.items()})
-
-
-def _is_key(leaf: Any) -> bool:
-    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
-
-
-def _key_impl(leaf: Any) -> Any:
-    return jax.random.key_impl(jnp.zeros((), leaf.dtype))  # an abstract leaf has no implementation to ask
-
-
-def _plain_spec(leaf: Any) -> Spec:
-    plain = jax.eval_shape(jax.random.key_data, leaf) if _is_key(leaf) else leaf
-    return plain.shape, plain.dtype
-
-
-def _from_plain(array: np.ndarray | None, leaf: Any) -> jax.Array:
-    if array is None:  # it has no entries
-        return jnp.zeros(leaf.shape, leaf.dtype)
-    if _is_key(leaf):
-        array = jax.random.wrap_key_data(jnp.asarray(array), impl=_key_impl(leaf))
-    return jax.device_put(array, leaf.sharding if getattr(leaf, "committed", False) else None)
 
 
 def _show(spec: Spec | None) -> str:

@@ -1,43 +1,23 @@
-"""Many devices: the rows of a program (the seeds of all points), or its environments, over all that JAX sees.
-
-They may belong to several hosts, each of which runs this program. All of them go through the same iterations and hold
-the same results, which the first writes to a folder that all see; what one learns alone, as that it shall stop, it tells
-the others.
-"""
+"""Many devices: the rows of a program (the seeds of all points), or its environments, over all that JAX sees."""
 
 import os
-import socket
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
-from jax.experimental import multihost_utils
 from jax.sharding import AxisType, Mesh, NamedSharding
 from jax.sharding import PartitionSpec as Spec
 
 from taic_jax.config import Config, ConfigError, Shard
 from taic_jax.envs.physics.mujoco import num_physical_cores
+from taic_jax.hosts import ALONE, Hosts, join, on_this_host
 
 Tree = TypeVar("Tree")
 
 SEEDS, ENVS = "seeds", "envs"
-PATIENCE = 20.0
-"""Seconds in which the first host must answer the others."""
-
-
-class Hosts(NamedTuple):
-    """Of a run over several hosts: where the first one can be reached, how many they are, and which this is."""
-
-    coordinator: str = ""
-    count: int = 1
-    index: int = 0
-
-
-ALONE = Hosts()
 
 
 @dataclass(frozen=True)
@@ -74,7 +54,7 @@ class Devices:
         """Return the first `count` rows, all but those that `place` added, on every host."""
         if jax.process_count() > 1:
             rows = jax.jit(lambda rows: rows, out_shardings=NamedSharding(self.mesh, Spec()))(rows)
-            rows = jax.tree.map(_on_this_host, rows)
+            rows = jax.tree.map(on_this_host, rows)
         return jax.tree.map(lambda x: x if len(x) == count else x[:count], rows)
 
     def compile(self, function: Callable, *args: Any, donate: bool = False) -> Callable:
@@ -101,45 +81,18 @@ def open_devices(shard: Shard, rows: int, hosts: Hosts = ALONE) -> Shard:
     for the others.
 
     Raises:
-      ConfigError: over several hosts nothing is to be split, or they cannot be reached.
+      ConfigError: the other hosts cannot be reached.
     """
     told = "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
     if shard != "none" and not told and jax.config.values["jax_num_cpu_devices"] < 1:
         cores = num_physical_cores()
         jax.config.update("jax_num_cpu_devices", cores if shard == ENVS else min(cores, -(-rows // hosts.count)))
     if hosts.count > 1:
-        if shard == "none":
-            raise ConfigError("--shard: expected what to split over the hosts, seeds or envs, got none")
-        _join(hosts)
+        join(hosts)
     if shard == "auto":
         alone = ENVS if hosts.count > 1 else "none"
         return SEEDS if min(rows, jax.device_count()) > 1 else alone
     return shard
-
-
-def _join(hosts: Hosts) -> None:
-    """Meet the other hosts at the first one.
-
-    Raises:
-      ConfigError: it does not answer, or not all come.
-    """
-    name, _, port = hosts.coordinator.rpartition(":")
-    until = time.monotonic() + PATIENCE
-    while hosts.index:
-        try:
-            socket.create_connection((name, int(port)), PATIENCE).close()
-            break
-        except OSError as error:
-            if time.monotonic() > until:
-                told = (
-                    f"--hosts.coordinator: {hosts.coordinator} has not answered for {PATIENCE:.0f} s ({error.strerror})"
-                )
-                raise ConfigError(f"{told}; start host 0 there first") from None
-            time.sleep(0.2)
-    try:
-        jax.distributed.initialize(hosts.coordinator, hosts.count, hosts.index)
-    except RuntimeError as error:
-        raise ConfigError(f"--hosts: {hosts.count} hosts did not meet at {hosts.coordinator}: {error}") from None
 
 
 def make_devices(shard: Shard, config: Config) -> Devices:
@@ -157,22 +110,6 @@ def make_devices(shard: Shard, config: Config) -> Devices:
                 f"got {ppo.num_envs}; the nearest valid value is {nearest}"
             )
     return Devices(shard)
-
-
-def agree(numbers: Sequence[int], least: bool = False) -> list[int]:
-    """Return the greatest of each number over all hosts, or the least; every host must ask."""
-    if jax.process_count() == 1:
-        return list(numbers)
-    all_numbers = multihost_utils.process_allgather(np.asarray(numbers, np.int32))
-    return (all_numbers.min(axis=0) if least else all_numbers.max(axis=0)).tolist()
-
-
-def _on_this_host(x: jax.Array) -> Any:
-    """Return an array that every device has, as one that is free to go to any."""
-    x = x.addressable_data(0)
-    if jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key):
-        return jax.random.wrap_key_data(np.asarray(jax.random.key_data(x)), impl=jax.random.key_impl(x))
-    return jax.numpy.asarray(np.asarray(x))
 
 
 def over_envs(scan: Callable[[Any, Any], tuple[Any, Any]], num_envs: int) -> Callable[[Any, Any], tuple[Any, Any]]:

@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import sys
-import tempfile
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -20,7 +19,7 @@ from taic_jax.envs import environment_options, make_env
 from taic_jax.envs.base import Env
 from taic_jax.envs.errors import RenderingError
 from taic_jax.experience import EXPERIENCE, ExperienceStore, gather_experience, num_blocks
-from taic_jax.files import save_text, writes_here
+from taic_jax.files import save_text
 from taic_jax.guard import FINITE
 from taic_jax.level import FineTunedLevel, Level, Trained
 from taic_jax.logging import RunLogger
@@ -30,7 +29,7 @@ from taic_jax.options import learning
 from taic_jax.options.dataset import Dataset, Experience, holds_out, make_dataset
 from taic_jax.options.execution import IdentityExecutor, make_executor
 from taic_jax.options.model import Networks, OptionModel, make_networks
-from taic_jax.run_folder import claimed, prepare_folder
+from taic_jax.run_folder import claimed, log_folder, prepare_folder
 from taic_jax.stage import CLOCK, Clock, Run, drive
 from taic_jax.summary import as_summary, write_video
 from taic_jax.types import as_rows
@@ -74,9 +73,7 @@ def run_pipeline(
     # Seed k of a run is seed 0 of a run whose seed is k more.
     keys = jnp.stack([jax.random.key(config.seed + k) for _ in points for k in range(config.seeds)])
     model, policy = _for_points((model, policy), len(points))
-    elsewhere = tempfile.TemporaryDirectory()  # of several hosts, the logs of all but the first
-    log_dir = run_dir if writes_here() else Path(elsewhere.name)
-    with elsewhere, claimed(run_dir), RunLogger(log_dir) as logger:
+    with claimed(run_dir), log_folder(run_dir) as logs, RunLogger(logs) as logger:
         clock = Clock.load(run_dir / CLOCK)
         run = Run(as_rows(points, config.seeds), keys, run_dir, logger, clock, devices=devices, **settings)
         logger.truncate("evaluate", -1)

@@ -1,6 +1,5 @@
 """The command line: `python -m taic_jax.run [CONFIG] [--run-dir DIR] [--section.field value ...]`."""
 
-import re
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -42,20 +41,31 @@ def parse(args: Sequence[str]) -> Command:
     Raises:
       ConfigError: an argument, the named preset or file, or a value is not valid.
     """
-    command = command_line.parse(args, PROGRAM, Command)
+    return command_line.parse(args, PROGRAM, Command)
+
+
+def _check_hosts(command: Command) -> None:
     if command.hosts < 1:
-        raise ConfigError(f"--hosts: expected at least 1, got {command.hosts}")
-    if not 0 <= command.host < command.hosts:
-        raise ConfigError(f"--host: expected 0 to {command.hosts - 1}, got {command.host}")
-    if command.hosts > 1 and command.run_dir is None:
+        raise ConfigError(f"--hosts: expected at least 1, got {command.hosts}; the nearest valid value is 1")
+    last = command.hosts - 1
+    if not 0 <= command.host <= last:
+        nearest = min(max(command.host, 0), last)
+        raise ConfigError(f"--host: expected 0 to {last}, got {command.host}; the nearest valid value is {nearest}")
+    if command.hosts == 1:
+        return
+    if command.run_dir is None:
         raise ConfigError("--hosts: expected --run-dir DIR too, a folder that every host sees")
-    if command.hosts > 1 and not re.fullmatch(r".+:\d{1,5}", command.coordinator):
-        raise ConfigError(f"--coordinator: expected HOST:PORT of the first host, got {command.coordinator!r}")
-    return command
+    host, _, port = command.coordinator.rpartition(":")
+    if not host or not port.isdigit() or not 1 <= int(port) <= 65535:
+        told = f"expected HOST:PORT of the first host, with a port from 1 to 65535, got {command.coordinator!r}"
+        raise ConfigError(f"--coordinator: {told}")
+    if command.shard == "none":
+        raise ConfigError("--shard: expected what to split over the hosts, seeds or envs, got none")
 
 
 def execute(command: Command) -> int:
     """Run the experiment, or only print its configuration and plan; return the exit code."""
+    _check_hosts(command)
     if command.replay:
         from taic_jax.replay import replay
 
@@ -63,7 +73,8 @@ def execute(command: Command) -> int:
         print(found or f"{command.replay}: all numbers were finite this time")
         return 0 if found else FAILED
     from taic_jax.compilation import keep_programs
-    from taic_jax.devices import Hosts, open_devices
+    from taic_jax.devices import open_devices
+    from taic_jax.hosts import Hosts
     from taic_jax.pipeline import make_envs, run_pipeline
     from taic_jax.summary import plan
 

@@ -2,13 +2,15 @@
 
 import contextlib
 import shutil
+import tempfile
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
 from taic_jax.config import COLLECT, Config, walk
 from taic_jax.config_io import load_config, to_yaml
-from taic_jax.devices import agree
 from taic_jax.files import PARTIAL, SaveError, remove_partial, save_text, writes_here, writing
+from taic_jax.hosts import agree
 
 try:
     import fcntl
@@ -28,8 +30,12 @@ def prepare_folder(config: Config, run_dir: Path, *, resume: bool = False, overw
     """Make the run folder, or check that it is the one to resume; of several hosts, the first does, and all hear of it.
 
     Raises:
-      RunFolderError: the folder holds another run, or none where one is to be resumed, or cannot be written.
+      RunFolderError: the folder holds another run, or none where one is to be resumed, or cannot be written; or
+        the hosts were given different configs.
     """
+    told = zlib.crc32(to_yaml(config).encode()) >> 1  # a number of 31 bits
+    if agree([told]) != agree([told], least=True):
+        raise RunFolderError("--hosts: expected the same config on every host, got different ones")
     refused = None
     if writes_here():
         try:
@@ -108,3 +114,13 @@ def _make_room(config: Config, run_dir: Path, overwrite: bool) -> None:
 def _holds_files(run_dir: Path) -> bool:
     """Tell whether anything is there but what a process that was killed at its very start leaves."""
     return any(path.suffix != PARTIAL for path in run_dir.iterdir())
+
+
+@contextlib.contextmanager
+def log_folder(run_dir: Path) -> Iterator[Path]:
+    """Give the folder to log to: the run's own, or on a host that does not write, one that is thrown away."""
+    if writes_here():
+        yield run_dir
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        yield Path(folder)

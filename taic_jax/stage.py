@@ -15,9 +15,10 @@ import numpy as np
 
 from taic_jax.checkpoint import ArtifactError, Checkpoints, save_tree
 from taic_jax.config import Config
-from taic_jax.devices import Devices, agree
+from taic_jax.devices import Devices
 from taic_jax.files import save_text
 from taic_jax.guard import FINITE, QUANTITIES, Guarded, begin, guarded
+from taic_jax.hosts import agree
 from taic_jax.interruption import DivergedError, Interrupted, Signals
 from taic_jax.logging import RunLogger
 from taic_jax.population import Members, Population
@@ -131,6 +132,12 @@ class Run:
         return compiled
 
 
+def _resume(checkpoints: Checkpoints, guard: Guarded) -> tuple[Guarded, int]:
+    """Return the last checkpoint that every host sees, and its step; without one, what is given, and 0."""
+    (step,) = agree([checkpoints.latest_step() or 0], least=True)
+    return checkpoints.load(step, guard) if step else guard, step
+
+
 def drive(
     run: Run,
     stage: str,
@@ -163,9 +170,7 @@ def drive(
       SaveError: something cannot be written; the checkpoints before are still there.
     """
     checkpoints = Checkpoints(run.dir / "checkpoints" / stage)
-    guard = begin(state, run.inherited(stage))
-    (first,) = agree([checkpoints.latest_step() or 0], least=True)
-    guard = checkpoints.load(first, guard) if first else guard
+    guard, first = _resume(checkpoints, begin(state, run.inherited(stage)))
     run.clock.ticks += first * ticks
     run.logger.truncate(stage, first * unit)
     known = run.stop(stage, guard, unit)

@@ -13,7 +13,7 @@ from taic_jax.config import COLLECT, Config, collector_is_baseline, needs_collec
 from taic_jax.envs.base import Env
 from taic_jax.evaluate import record
 from taic_jax.experience import experience_bytes
-from taic_jax.files import whole_file
+from taic_jax.files import whole_file, writes_here
 from taic_jax.guard import FINITE, QUANTITIES
 from taic_jax.rl.ppo import Agent, num_iterations
 from taic_jax.stage import Run, Stopped
@@ -119,7 +119,7 @@ def write_video(run: Run, env: Env, agent: Agent) -> None:
     from taic_jax.envs.rendering import write_webp  # it imports matplotlib, which takes a while
 
     ticks = run.config.evaluate.video_ticks
-    if not ticks:
+    if not ticks or not writes_here():
         return
     agent = jax.device_get(jax.tree.map(lambda x: x[0], agent))
     physics = jax.jit(lambda agent, key: record(env, agent, key, ticks))(agent, run.stage_keys("video")[0])

@@ -159,6 +159,16 @@ BAD_ARGUMENTS = {
     ),
     "resume what": ("--resume", "--resume: expected", "--run-dir"),
     "resume and overwrite": ("--resume --overwrite --run-dir x", "--resume and --overwrite", "at most one"),
+    "no hosts": ("--hosts 0", "--hosts: expected at least 1", "got 0; the nearest valid value is 1"),
+    "host beyond the last": ("--hosts 2 --host 2", "--host: expected 0 to 1", "got 2; the nearest valid value is 1"),
+    "hosts without a folder": ("--hosts 2 --coordinator a:1", "--hosts: expected --run-dir DIR too", "every host"),
+    "hosts that meet nowhere": ("--hosts 2 --run-dir x", "--coordinator: expected HOST:PORT", "got ''"),
+    "port beyond the last": ("--hosts 2 --run-dir x --coordinator a:99999", "--coordinator: expected", "1 to 65535"),
+    "hosts with nothing split": (
+        "--hosts 2 --run-dir x --coordinator a:1 --shard none",
+        "--shard: expected what to split over the hosts",
+        "got none",
+    ),
 }
 
 
