@@ -1,117 +1,263 @@
-"""Measure ticks per second side by side: the C engine alone, rollout in jit, flat training.
+"""Measure ticks per second side by side: engine, rollout in jit, training flat and over options, other libraries.
 
-python -m taic_jax.experiments.throughput --task half_cheetah --json throughput.json
+python -m taic_jax.experiments.throughput --task half_cheetah --peers --json throughput.json
+python -m taic_jax.experiments.throughput --task nav2d --scaling --sweep
 """
 
 import dataclasses
 import json
-import statistics
-import time
-from collections.abc import Callable
-from functools import partial
+import sys
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import jax
-import mujoco.batch
 import numpy as np
 import tyro
 
-from taic_jax import config, envs
-from taic_jax.envs.physics.mujoco import num_physical_cores
+from taic_jax import envs
+from taic_jax.compilation import keep_programs
+from taic_jax.config import ConfigError, PPOConfig
+from taic_jax.config_io import load_config, preset_names
+from taic_jax.envs.errors import MissingExtraError
+from taic_jax.experiments import peers
+from taic_jax.experiments.costs import scaling, shares
+from taic_jax.experiments.loops import (
+    WORK,
+    Training,
+    bare_engine,
+    has_engine,
+    learnt_executor,
+    options_config,
+    untrained_rollout,
+)
+from taic_jax.experiments.processes import Sweep, starts, sweep_costs
+from taic_jax.experiments.turns import Loop, Speeds, take_turns
 from taic_jax.options.execution import IdentityExecutor
-from taic_jax.rl import ppo
-from taic_jax.rl.rollout import rollout, start
-from taic_jax.types import as_arrays
 
-ROUNDS = 5
+HEADLINE = "option_training"
+PAPER = ("fixed", "open")
+"""The options of the row that stands for option training: the paper's."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
-    """Measure ticks per second on one task."""
+    """Measure ticks per second on one task, in loops that take turns."""
 
     task: str = "half_cheetah"
-    """A task whose physics is MuJoCo's."""
+    """The task."""
+    peers: bool = False
+    """Measure other libraries at the same work too (extra peers), on Gymnasium's models."""
+    model: Literal["", "brax", "gym"] = ""
+    """MJCF and rules of the task, as env.model; empty takes gym beside peers, and brax alone."""
     num_envs: int = 256
     """Environments of the engine and of the rollout."""
     rollout_length: int = 128
-    """Ticks per environment and measurement."""
+    """Their ticks per environment."""
+    training: PPOConfig = WORK
+    """Work of an iteration of training, ours and the peers'."""
+    seeds: int = 5
+    """Seeds of the rows with several."""
+    rules: tuple[Literal["fixed", "output", "predict"], ...] = ("fixed", "output", "predict")
+    """Termination rules."""
+    decoders: tuple[Literal["open", "closed"], ...] = ("open", "closed")
+    """Decoders."""
+    steps: int = 200
+    """Gradient steps in which the options are learnt; it changes how long they last, and so the speed."""
+    rounds: int = 5
+    """Rounds in which each loop runs once; the table tells medians."""
+    starts: bool = False
+    """Measure too how long a run takes to its first logged iteration, with an empty and a filled cache of programs."""
+    scaling: bool = False
+    """Measure too what a tick costs as environments, seeds, option length and observation size grow by 16."""
+    sweep: bool = False
+    """Measure too 64 points x 4 seeds in one program, in a loop, and in separate processes."""
+    sweep_ticks: int = 65536
+    """Ticks of each run of the sweep."""
     json: Path | None = None
-    """Also write the table to this file."""
+    """Also write the figures to this file."""
 
 
-def engine(env: envs.Env, num_envs: int, length: int) -> Callable[[], Any]:
-    """Return a loop over `mujoco.batch` from NumPy with random controls, on as many threads as the backend uses."""
-    batch = mujoco.batch.Batch(env.model, num_envs, num_physical_cores())
-    ctrl, random = batch.bind("ctrl"), np.random.default_rng(0)
-    noise = random.uniform(-1, 1, (length, *ctrl.shape))
+def make_env(arguments: Arguments) -> envs.Env:
+    """Make the task with the model asked for.
 
-    def run() -> None:
-        batch.reset()
-        for row in noise:
-            ctrl[:] = row
-            batch.step(nstep=env.physics.substeps)
-
-    return run
+    Raises:
+      UnknownNameError: there is no such task.
+      MissingExtraError: its model needs a package that is not installed.
+    """
+    takes_model = "model" in envs.environment_options(arguments.task)
+    model = arguments.model or ("gym" if arguments.peers and takes_model else "brax")
+    return envs.make_env(arguments.task, model=model)
 
 
-def rollout_in_jit(env: envs.Env, num_envs: int, length: int) -> Callable[[], Any]:
-    """Return a compiled rollout with a 64x64 policy."""
-    executor, key = IdentityExecutor(env.action_size), jax.random.key(0)
-    settings = as_arrays(config.PPOConfig(num_envs=num_envs, rollout_length=length))
-    state = ppo.init(settings, env, executor, key)
-    decide = ppo.as_agent(settings, executor, state).decide()
-    running = start(envs.AutoReset(env), executor, num_envs, key)
-    compiled = jax.jit(lambda running: rollout(envs.AutoReset(env), executor, decide, running, key, length))
-    return lambda: jax.block_until_ready(compiled(running))
+def our_loops(arguments: Arguments, env: envs.Env) -> list[Loop]:
+    """Return the loops of the engine, the rollout, and training: flat, over options, and of several seeds."""
+    ticks = arguments.num_envs * arguments.rollout_length
+    compiled, begin = untrained_rollout(env, arguments.num_envs, arguments.rollout_length)
+    seen = compiled(begin)[1]
+    loops = [Loop("engine", bare_engine(env, seen.action), ticks)] if has_engine(env) else []
+    loops.append(Loop("rollout", lambda: jax.block_until_ready(compiled(begin)), ticks))
+    executors = {"flat_training": IdentityExecutor(env.action_size)}
+    kinds = [(rule, decoder) for decoder in arguments.decoders for rule in arguments.rules]
+    for kind in kinds:
+        name = HEADLINE if kind == PAPER else f"{HEADLINE}/{'/'.join(kind)}"
+        executors[name] = learnt_executor(env, seen, options_config(*kind, arguments.steps))
+    for name, executor in executors.items():
+        training = Training(env, executor, arguments.training)
+        loops.append(Loop(name, training, training.ticks))
+    for name in ("flat_training", HEADLINE):
+        if arguments.seeds > 1 and name in executors:
+            training = Training(env, executors[name], arguments.training, arguments.seeds)
+            loops.append(Loop(f"{name}/{arguments.seeds} seeds", training, training.ticks))
+    return loops
 
 
-def flat_training(env: envs.Env, settings: config.PPOConfig) -> Callable[[], Any]:
-    """Return a compiled iteration of flat PPO: rollout, advantages and all updates."""
-    executor = IdentityExecutor(env.action_size)
-    settings = as_arrays(settings)
-    state = ppo.init(settings, env, executor, jax.random.key(0))
-    compiled = jax.jit(partial(ppo.iterate, settings, env, executor, 100))
-    return lambda: jax.block_until_ready(compiled(state))
+def peer_loops(arguments: Arguments) -> tuple[list[Loop], dict[str, str]]:
+    """Return the loops of the peers that run here, and a remark on each: its setting, or why it does not run."""
+    loops, remarks = [], {}
+    for name, make, tasks in (
+        ("stable_baselines3", peers.make_stable_baselines, peers.GYMNASIUM),
+        ("envpool_pytorch", peers.make_envpool, peers.ENVPOOL),
+    ):
+        if arguments.task not in tasks:
+            remarks[name] = "has no such task"
+            continue
+        try:
+            peer, remarks[name] = make(arguments.task, arguments.training)
+        except MissingExtraError as error:
+            remarks[name] = str(error)
+            continue
+        loops.append(Loop(name, peer, peer.ticks))
+    return loops, remarks
 
 
-def measure(arguments: Arguments) -> dict[str, dict[str, float]]:
-    """Return median ticks per second of each part and its ratio to the engine, round by round."""
-    env = envs.make_env(arguments.task)
-    size = (arguments.num_envs, arguments.rollout_length)
-    settings = config.PPOConfig()
-    parts = {
-        "engine": (engine(env, *size), size[0] * size[1]),
-        "rollout": (rollout_in_jit(env, *size), size[0] * size[1]),
-        "flat_training": (flat_training(env, settings), settings.num_envs * settings.rollout_length),
-    }
-    speeds: dict[str, list[float]] = {name: [] for name in parts}
-    for run, _ in parts.values():
-        run()  # compile and warm up
-    for _ in range(ROUNDS):
-        for name, (run, ticks) in parts.items():
-            begun = time.perf_counter()
-            run()
-            speeds[name].append(ticks / (time.perf_counter() - begun))
-    return {
-        name: {
-            "ticks_per_second": statistics.median(values),
-            "ratio_to_engine": statistics.median(np.divide(values, speeds["engine"])),
-        }
-        for name, values in speeds.items()
-    }
+def measure_brax(arguments: Arguments) -> tuple[dict[str, Speeds], str]:
+    """Return the speed of Brax's PPO, if it runs, and the remark on it."""
+    from taic_jax.experiments.peers.brax_ppo import DoesNotRunError, ticks_per_second
+
+    if arguments.task not in peers.BRAX:
+        return {}, "has no such task"
+    try:
+        rounds = ticks_per_second(peers.BRAX[arguments.task], arguments.training)
+    except DoesNotRunError as error:
+        return {}, str(error)
+    return {"brax": Speeds(rounds, float("nan"))}, "spring pipeline; takes no turns with the others"
 
 
-def main() -> None:
-    """Print the table."""
-    arguments = tyro.cli(Arguments)
-    table = measure(arguments)
-    for name, row in table.items():
-        print(f"{name:15} {row['ticks_per_second']:12,.0f} ticks/s   {row['ratio_to_engine']:5.2f} x engine")
-    if arguments.json:
-        arguments.json.write_text(json.dumps(table, indent=2) + "\n")
+def measure(arguments: Arguments, env: envs.Env) -> dict[str, dict[str, Any]]:
+    """Return a row per loop: median ticks per second, medians of its ratios round by round, and a remark.
+
+    Ratios are to the engine and to flat training; what does not run has a remark alone.
+    """
+    loops, remarks = our_loops(arguments, env), {}
+    if arguments.peers:
+        others, remarks = peer_loops(arguments)
+        loops += others
+    speeds = take_turns(loops, arguments.rounds)
+    for loop in loops:
+        if isinstance(loop.run, Training) and HEADLINE in loop.name:
+            remarks[loop.name] = f"{loop.run.duration:.1f} ticks a decision"
+    if arguments.peers:
+        brax, remarks["brax"] = measure_brax(arguments)
+        speeds |= brax
+    return {name: row(speeds, name, remarks.get(name, "")) for name in dict.fromkeys([*speeds, *remarks])}
+
+
+def row(speeds: dict[str, Speeds], name: str, remark: str) -> dict[str, Any]:
+    """Return one row of the table; what was not measured is None."""
+    told: dict[str, Any] = {"ticks_per_second": speeds[name].median if name in speeds else None}
+    for other, field in (("engine", "ratio_to_engine"), ("flat_training", "ratio_to_flat_training")):
+        told[field] = None
+        if name in speeds and other in speeds:
+            same = len(speeds[name].rounds) == len(speeds[other].rounds)
+            medians = speeds[name].median / speeds[other].median
+            told[field] = speeds[name].ratio(speeds[other]) if same else medians
+    return told | {"first_call_seconds": speeds[name].first_call if name in speeds else None, "remark": remark}
+
+
+def check(arguments: Arguments) -> None:
+    """Refuse what could only fail after minutes.
+
+    Raises:
+      ConfigError: a number is too small, the minibatches of peers would not be equal, or a file cannot be written.
+    """
+    for name in ("num_envs", "rollout_length", "seeds", "steps", "rounds", "sweep_ticks"):
+        if getattr(arguments, name) < 1:
+            raise ConfigError(f"--{name.replace('_', '-')}: expected at least 1, got {getattr(arguments, name)}")
+    ticks, size = arguments.training.num_envs * arguments.training.rollout_length, arguments.training.minibatch_size
+    if size < 1 or ticks % size:
+        raise ConfigError(f"--training.minibatch-size: expected a divisor of the {ticks} ticks, got {size}")
+    if arguments.json and not arguments.json.parent.is_dir():
+        raise ConfigError(f"--json: there is no folder {arguments.json.parent}")
+    if arguments.starts and arguments.task not in preset_names():
+        raise ConfigError(f"--starts: expected a task with a preset of its name ({', '.join(preset_names())})")
+
+
+def report(arguments: Arguments) -> dict[str, Any]:
+    """Measure all that is asked for, print each table when it is there, and return the figures."""
+    env = make_env(arguments)
+    figures: dict[str, Any] = {}
+    if arguments.starts:  # before this process holds memory and threads
+        figures["starts"] = starts(arguments.task)
+    rows = measure(arguments, env)
+    for name in ("engine", "rollout", "flat_training", HEADLINE):
+        figures[name] = rows.get(name, {}).get("ticks_per_second")
+    figures |= {"task": arguments.task, "rows": rows, "shares": shares(env, arguments.training, arguments.rounds)}
+    show(figures)
+    if arguments.scaling:
+        figures["scaling"] = []
+        for cost in scaling(env, arguments.training, arguments.steps, arguments.rounds):
+            print(f"{cost.axis:17} {cost.value:4}   {cost.microseconds:8.2f} us/tick   {cost.of_linear:5.2f} of linear")
+            figures["scaling"].append(dataclasses.asdict(cost))
+    if arguments.sweep:
+        config = load_config("nav2d").train.ppo if arguments.task == "nav2d" else arguments.training
+        figures["sweep"] = sweep_costs(Sweep(arguments.task, 64, 4, arguments.sweep_ticks, config), 8)
+        show_sweep(figures["sweep"])
+    return figures
+
+
+def show(figures: dict[str, Any]) -> None:
+    """Print the table of speeds, where the time of an iteration goes, and how long starts take."""
+    print(f"{figures['task']:32} {'ticks/s':>12} {'of engine':>10} {'of flat':>8} {'first call':>11}")
+    for name, told in figures["rows"].items():
+        numbers = [
+            told[k] for k in ("ticks_per_second", "ratio_to_engine", "ratio_to_flat_training", "first_call_seconds")
+        ]
+        texts = [
+            "" if x is None or np.isnan(x) else form.format(x)
+            for x, form in zip(numbers, ("{:,.0f}", "{:.2f}", "{:.2f}", "{:.1f} s"), strict=True)
+        ]
+        print(f"{name:32} {texts[0]:>12} {texts[1]:>10} {texts[2]:>8} {texts[3]:>11}   {told['remark']}".rstrip())
+    print("share of an iteration:", ", ".join(f"{name} {share:.0%}" for name, share in figures["shares"].items()))
+    for name, value in figures.get("starts", {}).items():
+        print(f"{name} start to the first logged iteration: {value:.1f} s")
+
+
+def show_sweep(told: dict[str, float]) -> None:
+    """Print what a sweep costs in three ways."""
+    begin = f"{told['runs']} runs in one program: {told['one_program']:.1f} s"
+    print(f"{begin}; compilation {told['compile_one_program']:.1f} s")
+    for name in ("loop", "processes"):
+        ratio = told[name] / told["one_program"]
+        print(f"{name}: {told[name]:.1f} s, {ratio:.2f} x that; counted up from {told['runs_measured']} runs")
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Print the tables and return the exit code: 2 for a mistake of the user, told in one line."""
+    arguments = tyro.cli(Arguments, args=args)
+    try:
+        check(arguments)
+        keep_programs()
+        figures = report(arguments)
+        if arguments.json:
+            arguments.json.write_text(json.dumps(figures, indent=2) + "\n")
+    except ValueError as error:
+        if not type(error).__module__.startswith("taic_jax."):
+            raise
+        print("taic_jax: error:", " ".join(str(error).split()), file=sys.stderr)
+        return 2
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

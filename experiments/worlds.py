@@ -7,15 +7,13 @@ python -m taic_jax.experiments.worlds --soak --length 1000
 
 import dataclasses
 import json
-import statistics
-import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import mujoco.batch
 import numpy as np
 import tyro
 
@@ -24,6 +22,8 @@ from taic_jax.envs.arenas import outside
 from taic_jax.envs.physics.mjx import MjxPhysics
 from taic_jax.envs.physics.mujoco import MujocoPhysics
 from taic_jax.envs.third_party import third_party
+from taic_jax.experiments.loops import bare_engine, stepping
+from taic_jax.experiments.turns import Loop, take_turns
 
 ROUNDS = 7
 ARENAS = ("ant_maze", "ant_push", "ant_fall")
@@ -52,52 +52,12 @@ class Arguments:
     """Also write the table to this file."""
 
 
-def ours(env: envs.Env, num_envs: int, length: int) -> Callable[[], Any]:
-    """Return the task's compiled loop with time limit and automatic reset, under random actions."""
-    env = envs.AutoReset(env)
-    state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), num_envs))
-    actions = _random_actions(env, num_envs, length)
-    step = jax.vmap(env.step)
-
-    def run(state: envs.State) -> envs.State:
-        return jax.lax.scan(lambda state, action: (step(state, action), state.reward), state, actions)[0]
-
-    compiled = jax.jit(run)
-    return lambda: jax.block_until_ready(compiled(state))
-
-
-def bare_engine(env: envs.Env, num_envs: int, length: int) -> Callable[[], Any]:
-    """Return a loop over `mujoco.batch` from NumPy that steps the very states which `ours` steps.
-
-    They are set at each tick: alone, robots that nothing resets soon lie on the ground or fall through it,
-    which costs the engine more or less than what it is compared with.
-    """
-    wrapped = envs.AutoReset(env)
-    actions, step = _random_actions(env, num_envs, length), jax.vmap(wrapped.step)
-
-    def tick(state: envs.State, action: jax.Array) -> tuple[envs.State, jax.Array]:
-        sent = [state.physics.qpos, state.physics.qvel, state.physics.qacc_warmstart, action]
-        return step(state, action), jnp.concatenate(sent, axis=1)
-
-    start = jax.jit(jax.vmap(wrapped.reset))(jax.random.split(jax.random.key(0), num_envs))
-    states = np.asarray(jax.jit(lambda state: jax.lax.scan(tick, state, actions)[1])(start), np.float64)
-    batch = mujoco.batch.Batch(env.model, num_envs, env.physics.num_threads)
-    rows = batch.state[:, 1 : 1 + states.shape[2]]  # behind the time
-
-    def run() -> None:
-        for row in states:
-            rows[...] = row
-            batch.step(nstep=env.physics.substeps)
-
-    return run
-
-
-def plain_mjx(env: envs.Env, num_envs: int, length: int) -> Callable[[], Any]:
+def plain_mjx(env: envs.Env, actions: jax.Array) -> Callable[[], Any]:
     """Return a compiled loop of `mjx.step` with the same model and settings, that keeps the whole `mjx.Data`."""
     with third_party():
         from mujoco import mjx
-    data = jax.tree.map(lambda x: jnp.broadcast_to(x, (num_envs, *jnp.shape(x))), env.physics._data)
-    actions = jnp.repeat(_random_actions(env, num_envs, length), env.physics.substeps, axis=0)
+    data = jax.tree.map(lambda x: jnp.broadcast_to(x, (actions.shape[1], *jnp.shape(x))), env.physics._data)
+    actions = jnp.repeat(actions, env.physics.substeps, axis=0)
 
     def run(data: Any) -> Any:
         with third_party():
@@ -112,19 +72,6 @@ def _random_actions(env: envs.Env, num_envs: int, length: int) -> jax.Array:
     return jax.random.uniform(jax.random.key(1), (length, num_envs, env.action_size), minval=-1.0)
 
 
-def speeds(loops: list[Callable[[], Any]], ticks: int) -> list[list[float]]:
-    """Return ticks per second of each loop in each round; the loops take turns."""
-    result: list[list[float]] = [[] for _ in loops]
-    for loop in loops:
-        loop()  # compile and warm up
-    for _ in range(ROUNDS):
-        for loop, values in zip(loops, result, strict=True):
-            begun = time.perf_counter()
-            loop()
-            values.append(ticks / (time.perf_counter() - begun))
-    return result
-
-
 def measure(arguments: Arguments, task: str, backend: str) -> dict[str, Any]:
     """Return one row: sizes, possible contacts, ticks per second, and the ratio to the bare engine."""
     env = envs.make_env(task, backend)
@@ -132,15 +79,17 @@ def measure(arguments: Arguments, task: str, backend: str) -> dict[str, Any]:
     if backend in ("mjx", "warp"):
         num_envs, length = arguments.num_envs_mjx, arguments.length // 4
     row = {"task": task, "backend": backend, "obs": env.observation_size, "act": env.action_size, "envs": num_envs}
-    loops = [ours(env, num_envs, length)]
+    actions = _random_actions(env, num_envs, length)
+    loops = [Loop("ours", stepping(env, actions), actions[..., 0].size)]
     if hasattr(env.env, "physics"):
         row["contacts"] = possible_contacts(env)
-        loops.append((bare_engine if backend == "mujoco" else plain_mjx)(env, num_envs, length))
-    values = speeds(loops, num_envs * length)
-    row["ticks_per_second"] = statistics.median(values[0])
-    if len(values) > 1:
-        row["bare"] = statistics.median(values[1])
-        row["ratio"] = statistics.median(np.divide(*values))
+        bare = bare_engine if backend == "mujoco" else plain_mjx
+        loops.append(Loop("bare", bare(env, actions), actions[..., 0].size))
+    speeds = take_turns(loops, ROUNDS)
+    row["ticks_per_second"] = speeds["ours"].median
+    if "bare" in speeds:
+        row["bare"] = speeds["bare"].median
+        row["ratio"] = speeds["ours"].ratio(speeds["bare"])
     return row
 
 
@@ -183,10 +132,11 @@ def measure_solver(task: str, num_envs: int, length: int) -> Iterator[dict[str, 
         step = jax.jit(jax.vmap(physics.step))
         error = jnp.abs(step(state, ctrl).qvel - expected.qvel).max(axis=1)
         loop = jax.jit(lambda state, step=step: jax.lax.fori_loop(0, length, lambda _, s: step(s, ctrl), state))
-        (values,) = speeds([lambda loop=loop: jax.block_until_ready(loop(state))], num_envs * length)
+        run = partial(lambda loop: jax.block_until_ready(loop(state)), loop)
+        speeds = take_turns([Loop("loop", run, num_envs * length)], ROUNDS)["loop"]
         yield {
             "task": task, "iterations": iterations, "ls_iterations": ls_iterations,
-            "ticks_per_second": statistics.median(values),
+            "ticks_per_second": speeds.median,
             "median_error": float(jnp.median(error)), "worst_error": float(jnp.max(error)),
         }  # fmt: skip
 

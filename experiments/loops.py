@@ -1,0 +1,137 @@
+"""What the benchmark measures of ours: the engine alone, rollouts, and training, flat and over options.
+
+Each function returns the loop to call again and again; all that is called before is left out of the measurement.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco.batch
+import numpy as np
+from jaxtyping import Array, Float
+
+from taic_jax import envs
+from taic_jax.config import OptionsConfig, PPOConfig
+from taic_jax.experience import as_experience
+from taic_jax.options.execution import Executor, IdentityExecutor, OptionExecutor, make_executor
+from taic_jax.options.learning import learn
+from taic_jax.rl import ppo
+from taic_jax.rl.rollout import Rollout, Running, rollout, start
+from taic_jax.types import as_arrays
+
+WORK = PPOConfig(num_envs=64, rollout_length=256, epochs=10, minibatch_size=512)
+"""What an iteration of training is everywhere here: 64 x 256 ticks, 10 epochs of 32 minibatches, 64x64 networks."""
+VARIABLE_LENGTH = 10
+"""The most ticks that options take which may end earlier: those of termination fixed are 5 ticks long."""
+ITERATIONS = 100
+"""Of which one is measured; the step size decays over them."""
+
+
+def has_engine(env: envs.Env) -> bool:
+    """Return whether MuJoCo's C engine steps this task."""
+    return hasattr(getattr(env, "physics", None), "engine")
+
+
+def untrained_rollout(
+    env: envs.Env, num_envs: int, length: int
+) -> tuple[Callable[[Running], tuple[Running, Rollout]], Running]:
+    """Return a compiled rollout of `length` ticks with an untrained policy, and its start."""
+    executor, key = IdentityExecutor(env.action_size), jax.random.key(0)
+    state = ppo.init(as_arrays(PPOConfig(num_envs=num_envs)), env, executor, key)
+    decide = ppo.as_agent(PPOConfig(), executor, state).decide()
+    wrapped = envs.AutoReset(env)
+    compiled = jax.jit(lambda running: rollout(wrapped, executor, decide, running, key, length))
+    return compiled, start(wrapped, executor, num_envs, key)
+
+
+def stepping(env: envs.Env, actions: Float[Array, "T B A"]) -> Callable[[], Any]:
+    """Return the task's own compiled loop: engine, rewards, time limit and automatic resets under given actions."""
+    wrapped = envs.AutoReset(env)
+    state = jax.jit(jax.vmap(wrapped.reset))(jax.random.split(jax.random.key(0), actions.shape[1]))
+    step = jax.vmap(wrapped.step)
+
+    def run(state: envs.State) -> tuple[envs.State, Any]:
+        return jax.lax.scan(lambda state, action: (step(state, action), (state.obs, state.reward)), state, actions)
+
+    compiled = jax.jit(run)
+    return lambda: jax.block_until_ready(compiled(state))
+
+
+def bare_engine(env: envs.Env, actions: Float[Array, "T B A"]) -> Callable[[], Any]:
+    """Return a loop over `mujoco.batch` from NumPy that steps the very states which `stepping` steps.
+
+    They are set at each tick: alone, robots that nothing resets soon lie on the ground or fall through it,
+    which costs the engine more or less than what it is compared with.
+    """
+    wrapped = envs.AutoReset(env)
+    step = jax.vmap(wrapped.step)
+
+    def tick(state: envs.State, action: Array) -> tuple[envs.State, Array]:
+        sent = [state.physics.qpos, state.physics.qvel, state.physics.qacc_warmstart, action]
+        return step(state, action), jnp.concatenate(sent, axis=1)
+
+    begin = jax.jit(jax.vmap(wrapped.reset))(jax.random.split(jax.random.key(0), actions.shape[1]))
+    states = np.asarray(jax.jit(lambda state: jax.lax.scan(tick, state, actions)[1])(begin), np.float64)
+    batch = mujoco.batch.Batch(env.model, actions.shape[1], env.physics.num_threads)
+    rows = batch.state[:, 1 : 1 + states.shape[2]]  # behind the time
+
+    def run() -> None:
+        for row in states:
+            rows[...] = row
+            batch.step(nstep=env.physics.substeps)
+
+    return run
+
+
+class Training:
+    """An iteration of PPO, compiled: rollout, advantages and all updates, of K seeds side by side.
+
+    Args:
+      env: the task.
+      executor: of options, or of actions themselves.
+      config: the work.
+      seeds: K.
+    """
+
+    def __init__(self, env: envs.Env, executor: Executor, config: PPOConfig, seeds: int = 1):
+        self.ticks = seeds * config.num_envs * config.rollout_length
+        self.duration = 1.0
+        arrays = as_arrays(config)
+        keys = jax.random.split(jax.random.key(0), seeds)
+        step = partial(ppo.iterate, arrays, env, executor, ITERATIONS)
+        init = partial(ppo.init, arrays, env, executor)
+        self._state = jax.jit(jax.vmap(init) if seeds > 1 else lambda keys: init(keys[0]))(keys)
+        self._step = jax.jit(jax.vmap(lambda state: step(state)[:2]) if seeds > 1 else lambda state: step(state)[:2])
+
+    def __call__(self) -> None:
+        """Train for one iteration more than before."""
+        self._state, metrics = jax.block_until_ready(self._step(self._state))
+        self.duration = float(jnp.mean(metrics["duration"]))
+
+    @property
+    def gradient_steps(self) -> int:
+        """How many gradient steps each seed has taken so far."""
+        counts = [leaf for leaf in jax.tree.leaves(self._state.optimizer) if jnp.issubdtype(leaf.dtype, jnp.integer)]
+        return int(counts[0].reshape(-1)[0])
+
+
+def learnt_executor(env: envs.Env, ticks: Rollout, config: OptionsConfig) -> OptionExecutor:
+    """Return options learnt from the ticks of an untrained policy: how good they are changes no speed, how long does.
+
+    Raises:
+      ShortExperienceError: delta is a quantile, and the ticks are too few to hold a part of them out.
+    """
+    experience = as_experience(ticks, env.proprioceptive_size)
+    model, _ = jax.jit(lambda experience: learn(config, experience, jax.random.key(0)))(experience)
+    return make_executor(config, env.action_size, model)
+
+
+def options_config(rule: str, decoder: str, steps: int, **changes: Any) -> OptionsConfig:
+    """Return the options of one termination rule and decoder."""
+    length = {} if rule == "fixed" else {"length": VARIABLE_LENGTH}
+    settings: dict[str, Any] = {"termination": rule, "decoder": decoder, "steps": steps} | length | changes
+    return dataclasses.replace(OptionsConfig(), **settings)

@@ -1,0 +1,56 @@
+"""Brax's own PPO at the work of ours, on its `spring` pipeline."""
+
+import itertools
+import time
+from typing import Any
+
+import jax
+
+from taic_jax.config import PPOConfig
+from taic_jax.envs.third_party import third_party
+
+ITERATIONS = 3
+"""After the first, which compiles."""
+
+
+class DoesNotRunError(Exception):
+    """Brax's trainer fails on this JAX; one line."""
+
+
+def ticks_per_second(name: str, config: PPOConfig) -> list[float]:
+    """Train with Brax and return the ticks per second of each iteration but the first, which compiles.
+
+    Its loop cannot be entered from outside, so that it takes no turns with others.
+
+    Raises:
+      DoesNotRunError: it raises, whatever it is: Brax's trainer is older than this JAX.
+    """
+    times = [time.perf_counter()]
+    ticks = config.num_envs * config.rollout_length
+    minibatches = ticks // config.minibatch_size
+    with third_party():
+        from brax import envs
+        from brax.training.agents.ppo import networks, train
+
+        sizes = tuple(config.hidden_sizes)
+
+        def make_networks(*args: Any, **settings: Any) -> Any:
+            return networks.make_ppo_networks(
+                *args, policy_hidden_layer_sizes=sizes, value_hidden_layer_sizes=sizes, activation=jax.nn.tanh,
+                **settings,
+            )  # fmt: skip
+
+        try:
+            # Brax's batches are of environments: all their ticks at once. Each of its iterations is one rollout.
+            train.train(
+                envs.get_environment(name, backend="spring"), num_timesteps=ticks * (1 + ITERATIONS),
+                num_envs=config.num_envs, episode_length=1000, unroll_length=config.rollout_length,
+                batch_size=max(1, config.num_envs // minibatches), num_minibatches=minibatches,
+                num_updates_per_batch=config.epochs, learning_rate=config.learning_rate,
+                network_factory=make_networks, num_evals=2 + ITERATIONS, run_evals=False,
+                progress_fn=lambda *_: times.append(time.perf_counter()),
+            )  # fmt: skip
+        except Exception as error:
+            told = str(error).partition("\n")[0]
+            raise DoesNotRunError(f"does not run on jax {jax.__version__}: {type(error).__name__}: {told}") from error
+    return [ticks / (after - before) for before, after in itertools.pairwise(times[1:])]

@@ -1,0 +1,58 @@
+"""Stable-Baselines3's PPO on Gymnasium's environments; imports both, and PyTorch."""
+
+from typing import Any
+
+import gymnasium
+import torch
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+
+from taic_jax.config import PPOConfig
+
+WORKERS = {"DummyVecEnv": DummyVecEnv, "SubprocVecEnv": SubprocVecEnv}
+
+
+class StableBaselines:
+    """Train with Stable-Baselines3, an iteration a call; observations and rewards as they come, which costs less.
+
+    Args:
+      name: the environment's in Gymnasium.
+      options: of `gymnasium.make`.
+      config: the work.
+      workers: a key of `WORKERS`.
+      threads: of PyTorch.
+    """
+
+    def __init__(self, name: str, options: dict[str, Any], config: PPOConfig, workers: str, threads: int):
+        self.ticks, self._threads = config.num_envs * config.rollout_length, threads
+        # Where processes inherit nothing, or else they would inherit JAX's threads in the middle of what they do.
+        start = {"start_method": "forkserver"} if workers == "SubprocVecEnv" else {}
+        self._envs = WORKERS[workers]([lambda: gymnasium.make(name, **options)] * config.num_envs, **start)
+        sizes = list(config.hidden_sizes)
+        self._model = PPO(
+            "MlpPolicy", self._envs, learning_rate=config.learning_rate, n_steps=config.rollout_length,
+            batch_size=config.minibatch_size, n_epochs=config.epochs, gamma=config.gamma, gae_lambda=config.lambda_,
+            clip_range=config.clip, ent_coef=config.entropy_weight, vf_coef=config.value_weight,
+            max_grad_norm=config.max_grad_norm, device="cpu",
+            policy_kwargs={"net_arch": {"pi": sizes, "vf": sizes}, "activation_fn": torch.nn.Tanh},
+        )  # fmt: skip
+
+    def __call__(self) -> None:
+        """Train for one iteration more."""
+        torch.set_num_threads(self._threads)
+        self._model.learn(self.ticks, reset_num_timesteps=False)
+
+    @property
+    def made(self) -> int:
+        """How many ticks it has made so far."""
+        return self._model.num_timesteps
+
+    @property
+    def gradient_steps(self) -> int:
+        """How many gradient steps it has taken so far."""
+        states = self._model.policy.optimizer.state.values()
+        return max((int(state["step"]) for state in states), default=0)
+
+    def close(self) -> None:
+        """End the processes of its environments."""
+        self._envs.close()

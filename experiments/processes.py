@@ -1,0 +1,122 @@
+"""What takes processes to measure: starts with an empty and a filled cache, and a sweep run by run."""
+
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import jax
+
+from taic_jax import envs
+from taic_jax.compilation import keep_programs
+from taic_jax.config import PPOConfig
+from taic_jax.envs.physics.mujoco import num_physical_cores
+from taic_jax.experiments.turns import seconds
+from taic_jax.logging import read_metrics
+from taic_jax.options.execution import IdentityExecutor
+from taic_jax.rl import ppo
+from taic_jax.types import as_arrays, as_rows
+
+PATIENCE = 600.0
+"""Seconds after which a run that has logged nothing is given up."""
+POLL = 0.02
+
+
+def starts(task: str) -> dict[str, float]:
+    """Return the seconds to the first logged iteration of a run, with an empty cache of programs and with a filled one.
+
+    Raises:
+      RuntimeError: a run ended, or logged nothing.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        return {name: _first_iteration(task, Path(folder), name) for name in ("cold", "warm")}
+
+
+def _first_iteration(task: str, folder: Path, name: str) -> float:
+    """Start a run whose cache is in the folder, wait for the first row of its metrics, and stop it."""
+    environment = {key: value for key, value in os.environ.items() if not key.startswith("JAX_COMPILATION_CACHE")}
+    environment |= {"XDG_CACHE_HOME": str(folder / "cache")}
+    command = [sys.executable, "-m", "taic_jax.run", task, "--run-dir", str(folder / name)]
+    begun = time.perf_counter()
+    with subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as run:
+        try:
+            while not (rows := folder / name / "metrics.jsonl").is_file() or not read_metrics(rows):
+                if run.poll() is not None or time.perf_counter() - begun > PATIENCE:
+                    raise RuntimeError(f"{' '.join(command)} logged nothing: exit code {run.poll()}")
+                time.sleep(POLL)
+            return time.perf_counter() - begun
+        finally:
+            run.kill()
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """A grid of step sizes, each with seeds, of flat training on one task.
+
+    Every way of running it does the same work: `points` x `seeds` runs of `ticks` ticks.
+    """
+
+    task: str
+    points: int
+    seeds: int
+    ticks: int
+    config: PPOConfig
+
+    def configs(self) -> list[PPOConfig]:
+        """Return the points, equally far apart in the logarithm."""
+        return [replace(self.config, learning_rate=1e-4 * 100 ** (i / self.points)) for i in range(self.points)]
+
+
+def sweep_costs(sweep: Sweep, runs: int) -> dict[str, float]:
+    """Return the seconds of a sweep in one program, in a loop over a compiled run, and in separate processes.
+
+    The first is measured whole; of the others `runs` runs each, counted up to all of them. Processes run as many at a
+    time as there are cores, with a filled cache. Compilation, which the first two do once, is told apart.
+    """
+    env = envs.make_env(sweep.task)
+    rows, total = as_rows(sweep.configs(), sweep.seeds), sweep.points * sweep.seeds
+    keys, train = jax.random.split(jax.random.key(0), total), partial(_train, env, sweep.ticks)
+    each = [(jax.tree.map(lambda x, i=i: x[i], rows), keys[i]) for i in range(total)]
+    told, programs = {"runs": total, "runs_measured": runs}, {}
+    for name, function, arguments in (("one_program", jax.vmap(train), (rows, keys)), ("loop", train, each[0])):
+        begun = time.perf_counter()
+        programs[name] = jax.jit(function).lower(*arguments).compile()
+        told[f"compile_{name}"] = time.perf_counter() - begun
+    _processes(sweep, 1)  # fills the cache
+    cores = num_physical_cores()
+    rounds = max(1, runs // cores)
+
+    def loop() -> None:
+        for run in each[:runs]:
+            jax.block_until_ready(programs["loop"](*run))
+
+    told["one_program"] = seconds(lambda: jax.block_until_ready(programs["one_program"](rows, keys)))
+    told["loop"] = seconds(loop) * total / runs
+    told["processes"] = seconds(lambda: [_processes(sweep, cores) for _ in range(rounds)]) * total / (rounds * cores)
+    return told
+
+
+def _train(env: envs.Env, ticks: int, config: PPOConfig, key: jax.Array) -> jax.Array:
+    return ppo.train(config, env, IdentityExecutor(env.action_size), key, ticks)[1]["return"]
+
+
+def _processes(sweep: Sweep, count: int) -> None:
+    """Run the first points of a sweep in `count` processes at once."""
+    names = "from taic_jax.config import PPOConfig; from taic_jax.experiments.processes import Sweep, run_alone"
+    code = [f"{names}; run_alone({sweep!r}, {point})" for point in range(count)]
+    started = [subprocess.Popen([sys.executable, "-W", "ignore", "-c", text]) for text in code]
+    for process in started:
+        if process.wait():
+            raise RuntimeError(f"run {sweep} alone: exit code {process.returncode}")
+
+
+def run_alone(sweep: Sweep, point: int) -> None:
+    """Run one seed of one point of a sweep in this process."""
+    keep_programs()
+    config = as_arrays(sweep.configs()[point])
+    train = jax.jit(partial(_train, envs.make_env(sweep.task), sweep.ticks))
+    jax.block_until_ready(train(config, jax.random.key(point)))
