@@ -8,6 +8,7 @@ import time
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import jax
 
@@ -81,7 +82,8 @@ def sweep_costs(sweep: Sweep, runs: int) -> dict[str, float]:
     rows, total = as_rows(sweep.configs(), sweep.seeds), sweep.points * sweep.seeds
     keys, train = jax.random.split(jax.random.key(0), total), partial(_train, env, sweep.ticks)
     each = [(jax.tree.map(lambda x, i=i: x[i], rows), keys[i]) for i in range(total)]
-    told, programs = {"runs": total, "runs_measured": runs}, {}
+    told: dict[str, float] = {"runs": total, "runs_measured": runs}
+    programs: dict[str, Any] = {}
     for name, function, arguments in (("one_program", jax.vmap(train), (rows, keys)), ("loop", train, each[0])):
         begun = time.perf_counter()
         programs[name] = jax.jit(function).lower(*arguments).compile()

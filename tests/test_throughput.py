@@ -171,7 +171,13 @@ def test_widened_observations_start_as_they_were():
 
 
 def test_scaling_goes_over_a_factor_of_16_each(monkeypatch):
-    monkeypatch.setattr("taic_jax.experiments.costs._at", lambda *args: Loop("", lambda: None, args[-1]))
+    class Fake:
+        def __init__(self, *arguments):
+            self.ticks = arguments[-1]
+
+        def __call__(self) -> None: ...
+
+    monkeypatch.setattr("taic_jax.experiments.costs._at", Fake)
     rows = list(scaling(envs.make_env("nav2d"), TINY, 1, 1))
     for axis in SMALLEST:
         values = [row.value for row in rows if row.axis == axis]

@@ -32,11 +32,15 @@ class Peer(Protocol):
 
     def __call__(self) -> None: ...
 
+    def close(self) -> None:
+        """Let go of its environments."""
+        ...
+
 
 class Tuned(NamedTuple):
     """The fastest of a peer's settings, and which it is."""
 
-    peer: Peer
+    peer: Any
     setting: str
 
 
