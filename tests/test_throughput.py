@@ -19,18 +19,10 @@ from taic_jax.options.execution import IdentityExecutor
 
 TINY = PPOConfig(num_envs=2, rollout_length=16, epochs=2, minibatch_size=16, hidden_sizes=(4,))
 TICKS, STEPS = 32, 4
-SMALL = ["--training.num-envs", "2", "--training.rollout-length", "16", "--training.epochs", "2"]
-SMALL += [
-    "--training.minibatch-size",
-    "16",
-    "--training.hidden-sizes",
-    "4",
-    "--num-envs",
-    "4",
-    "--rollout-length",
-    "16",
-]
-SMALL += ["--rounds", "1", "--steps", "2", "--rules", "fixed", "--decoders", "open"]
+SMALL = """
+    --training.num-envs 2 --training.rollout-length 16 --training.epochs 2 --training.minibatch-size 16
+    --training.hidden-sizes 4 --num-envs 4 --rollout-length 16 --rounds 1 --steps 2 --rules fixed --decoders open
+""".split()
 
 
 def test_the_work_is_the_one_promised():
@@ -205,7 +197,7 @@ BAD = {
     "--training.minibatch-size 500": "expected a divisor of the 16384 ticks",
     "--json nowhere/x.json": "no folder nowhere",
     "--task half_cheeta": "did you mean 'half_cheetah'",
-    "--task hopper --starts": "expected a task with a preset",
+    "--task ant_turn --starts": "expected a task with a preset",
 }
 
 
