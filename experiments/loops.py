@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 
 from taic_jax import envs
 from taic_jax.config import OptionsConfig, PPOConfig
+from taic_jax.devices import Devices
 from taic_jax.experience import as_experience
 from taic_jax.options.execution import Executor, IdentityExecutor, OptionExecutor, make_executor
 from taic_jax.options.learning import learn
@@ -27,6 +28,7 @@ WORK = PPOConfig(num_envs=64, rollout_length=256, epochs=10, minibatch_size=512)
 """What an iteration of training is everywhere here: 64 x 256 ticks, 10 epochs of 32 minibatches, 64x64 networks."""
 VARIABLE_LENGTH = 10
 """The most ticks that options take which may end earlier: those of termination fixed are 5 ticks long."""
+ONE_DEVICE = Devices()
 ITERATIONS = 100
 """Of which one is measured; the step size decays over them."""
 
@@ -95,17 +97,22 @@ class Training:
       executor: of options, or of actions themselves.
       config: the work.
       seeds: K.
+      devices: that the seeds are split over.
     """
 
-    def __init__(self, env: envs.Env, executor: Executor, config: PPOConfig, seeds: int = 1):
+    def __init__(
+        self, env: envs.Env, executor: Executor, config: PPOConfig, seeds: int = 1, devices: Devices = ONE_DEVICE
+    ):
         self.ticks = seeds * config.num_envs * config.rollout_length
         self.duration = 1.0
         arrays = as_arrays(config)
         keys = jax.random.split(jax.random.key(0), seeds)
         step = partial(ppo.iterate, arrays, env, executor, ITERATIONS)
         init = partial(ppo.init, arrays, env, executor)
-        self._state = jax.jit(jax.vmap(init) if seeds > 1 else lambda keys: init(keys[0]))(keys)
-        self._step = jax.jit(jax.vmap(lambda state: step(state)[:2]) if seeds > 1 else lambda state: step(state)[:2])
+        state = jax.jit(jax.vmap(init) if seeds > 1 else lambda keys: init(keys[0]))(keys)
+        self._state = devices.place(state)
+        iterate = jax.vmap(lambda state: step(state)[:2]) if seeds > 1 else lambda state: step(state)[:2]
+        self._step = devices.compile(iterate, self._state, donate=True)
 
     def __call__(self) -> None:
         """Train for one iteration more than before."""

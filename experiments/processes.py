@@ -1,12 +1,15 @@
-"""What takes processes to measure: starts with an empty and a filled cache, and a sweep run by run."""
+"""What takes processes to measure: starts with an empty and a filled cache, seeds over cores, a sweep run by run."""
 
+import multiprocessing
 import os
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +17,13 @@ import jax
 
 from taic_jax import envs
 from taic_jax.compilation import keep_programs
-from taic_jax.config import PPOConfig
+from taic_jax.config import OptionsConfig, PPOConfig
+from taic_jax.devices import Devices, open_devices
 from taic_jax.envs.physics.mujoco import num_physical_cores
+from taic_jax.experiments.loops import Training, learnt_executor, untrained_rollout
 from taic_jax.experiments.turns import seconds
 from taic_jax.logging import read_metrics
-from taic_jax.options.execution import IdentityExecutor
+from taic_jax.options.execution import Executor, IdentityExecutor
 from taic_jax.rl import ppo
 from taic_jax.types import as_arrays, as_rows
 
@@ -54,6 +59,62 @@ def _first_iteration(task: str, folder: Path, name: str) -> float:
             run.kill()
 
 
+class SeedsApart:
+    """Training of K seeds in a process of its own, split over its devices as those of a run are: the cores of a CPU.
+
+    A process has its devices once and for all, and beside these loops one seed is to have all cores as one device.
+
+    Args:
+      make_env: makes the task, in that process.
+      config: the work.
+      seeds: K.
+      options: are learnt there first; without them, training is flat.
+    """
+
+    def __init__(
+        self, make_env: Callable[[], envs.Env], config: PPOConfig, seeds: int, options: OptionsConfig | None = None
+    ):
+        context = multiprocessing.get_context("spawn")
+        self.ticks, self.duration = seeds * config.num_envs * config.rollout_length, 1.0
+        self._pipe, theirs = context.Pipe()
+        arguments = (theirs, make_env, config, seeds, options)
+        context.Process(target=_serve, args=arguments, daemon=True).start()  # which ends when this process does
+        theirs.close()
+
+    def __call__(self) -> None:
+        """Train for one iteration more than before.
+
+        Raises:
+          RuntimeError: the process has failed.
+        """
+        try:
+            self._pipe.send(None)
+            self.duration = self._pipe.recv()
+        except (EOFError, OSError):
+            raise RuntimeError("the process that trains several seeds has failed") from None
+
+
+def _serve(
+    pipe: Connection, make_env: Callable[[], envs.Env], config: PPOConfig, seeds: int, options: OptionsConfig | None
+) -> None:
+    """Train for an iteration whenever the other end asks, and tell it how many ticks a decision took."""
+    keep_programs()
+    shard = open_devices("auto", seeds)
+    env = make_env()
+    executor: Executor = IdentityExecutor(env.action_size)
+    if options is not None:
+        compiled, begin = untrained_rollout(env, config.num_envs, config.rollout_length)
+        executor = learnt_executor(env, compiled(begin)[1], options)
+    training = Training(env, executor, config, seeds, Devices(shard))
+    while True:
+        try:
+            pipe.recv()
+        except EOFError:
+            return
+        training()
+        pipe.send(training.duration)
+
+
 @dataclass(frozen=True)
 class Sweep:
     """A grid of step sizes, each with seeds, of flat training on one task.
@@ -72,7 +133,7 @@ class Sweep:
         return [replace(self.config, learning_rate=1e-4 * 100 ** (i / self.points)) for i in range(self.points)]
 
 
-def sweep_costs(sweep: Sweep, runs: int) -> dict[str, float]:
+def sweep_costs(sweep: Sweep, runs: int) -> dict[str, int | float]:
     """Return the seconds of a sweep in one program, in a loop over a compiled run, and in separate processes.
 
     The first is measured whole; of the others `runs` runs each, counted up to all of them. Processes run as many at a
@@ -82,7 +143,7 @@ def sweep_costs(sweep: Sweep, runs: int) -> dict[str, float]:
     rows, total = as_rows(sweep.configs(), sweep.seeds), sweep.points * sweep.seeds
     keys, train = jax.random.split(jax.random.key(0), total), partial(_train, env, sweep.ticks)
     each = [(jax.tree.map(lambda x, i=i: x[i], rows), keys[i]) for i in range(total)]
-    told: dict[str, float] = {"runs": total, "runs_measured": runs}
+    told: dict[str, int | float] = {"runs": total, "runs_measured": runs}
     programs: dict[str, Any] = {}
     for name, function, arguments in (("one_program", jax.vmap(train), (rows, keys)), ("loop", train, each[0])):
         begun = time.perf_counter()

@@ -8,6 +8,7 @@ import dataclasses
 import json
 import sys
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -31,7 +32,7 @@ from taic_jax.experiments.loops import (
     options_config,
     untrained_rollout,
 )
-from taic_jax.experiments.processes import Sweep, starts, sweep_costs
+from taic_jax.experiments.processes import SeedsApart, Sweep, starts, sweep_costs
 from taic_jax.experiments.turns import Loop, Speeds, take_turns
 from taic_jax.options.execution import IdentityExecutor
 
@@ -105,10 +106,10 @@ def our_loops(arguments: Arguments, env: envs.Env) -> list[Loop]:
     for name, executor in executors.items():
         training = Training(env, executor, arguments.training)
         loops.append(Loop(name, training, training.ticks))
-    for name in ("flat_training", HEADLINE):
-        if arguments.seeds > 1 and name in executors:
-            training = Training(env, executors[name], arguments.training, arguments.seeds)
-            loops.append(Loop(f"{name}/{arguments.seeds} seeds", training, training.ticks))
+    several = {"flat_training": None, HEADLINE: options_config(*PAPER, arguments.steps)}
+    for name in [name for name in several if name in executors and arguments.seeds > 1]:
+        training = SeedsApart(partial(make_env, arguments), arguments.training, arguments.seeds, several[name])
+        loops.append(Loop(f"{name}/{arguments.seeds} seeds", training, training.ticks))
     return loops
 
 
@@ -155,7 +156,7 @@ def measure(arguments: Arguments, env: envs.Env) -> dict[str, dict[str, Any]]:
         loops += others
     speeds = take_turns(loops, arguments.rounds)
     for loop in loops:
-        if isinstance(loop.run, Training) and HEADLINE in loop.name:
+        if isinstance(loop.run, Training | SeedsApart) and HEADLINE in loop.name:
             remarks[loop.name] = f"{loop.run.duration:.1f} ticks a decision"
     if arguments.peers:
         brax, remarks["brax"] = measure_brax(arguments)
@@ -233,7 +234,7 @@ def show(figures: dict[str, Any]) -> None:
         print(f"{name} start to the first logged iteration: {value:.1f} s")
 
 
-def show_sweep(told: dict[str, float]) -> None:
+def show_sweep(told: dict[str, int | float]) -> None:
     """Print what a sweep costs in three ways."""
     begin = f"{told['runs']} runs in one program: {told['one_program']:.1f} s"
     print(f"{begin}; compilation {told['compile_one_program']:.1f} s")

@@ -28,6 +28,7 @@ for _name, _value in CACHE.items():
     jax.config.update(_name, _value)
     os.environ[_name.upper()] = str(_value)
 jax.config.update("jax_disable_most_optimizations", True)
+os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "true"
 flags = "--xla_cpu_use_fusion_emitters=false"
 # Two devices to split over; all that does not ask for it is on the first.
 flags += " --xla_force_host_platform_device_count=2"

@@ -43,7 +43,7 @@ def begin(folder: Path, count: int, *args: str, differ: tuple[str, ...] = ()) ->
         subprocess.Popen(
             [*line, *(["--host", str(host)] if count > 1 else []), *(differ if host == count - 1 else ())],
             cwd=folder,
-            env=os.environ | {"PYTHONPATH": paths, "JAX_DISABLE_MOST_OPTIMIZATIONS": "1"},
+            env=os.environ | {"PYTHONPATH": paths},
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
             text=True,

@@ -2,6 +2,7 @@
 
 import json
 import sys
+from functools import partial
 
 import gymnasium
 import jax
@@ -11,7 +12,7 @@ from taic_jax import envs
 from taic_jax.config import ConfigError, PPOConfig
 from taic_jax.experiments import peers, processes, throughput
 from taic_jax.experiments.costs import SMALLEST, Widened, scaling, shares
-from taic_jax.experiments.loops import WORK, Training
+from taic_jax.experiments.loops import WORK, Training, options_config
 from taic_jax.experiments.peers import brax_ppo
 from taic_jax.experiments.processes import Sweep, sweep_costs
 from taic_jax.experiments.turns import Loop, Speeds, take_turns
@@ -19,10 +20,11 @@ from taic_jax.options.execution import IdentityExecutor
 
 TINY = PPOConfig(num_envs=2, rollout_length=16, epochs=2, minibatch_size=16, hidden_sizes=(4,))
 TICKS, STEPS = 32, 4
-SMALL = """
-    --training.num-envs 2 --training.rollout-length 16 --training.epochs 2 --training.minibatch-size 16
-    --training.hidden-sizes 4 --num-envs 4 --rollout-length 16 --rounds 1 --steps 2 --rules fixed --decoders open
-""".split()
+SMALL = [
+    "--training.num-envs", "2", "--training.rollout-length", "16", "--training.epochs", "2",
+    "--training.minibatch-size", "16", "--training.hidden-sizes", "4", "--num-envs", "4", "--rollout-length", "16",
+    "--rounds", "1", "--steps", "2", "--rules", "fixed", "--decoders", "open",
+]  # fmt: skip
 
 
 def test_the_work_is_the_one_promised():
@@ -48,6 +50,18 @@ def test_training_makes_the_ticks_and_gradient_steps(seeds):
     training()
     training()
     assert (training.ticks, training.gradient_steps) == (seeds * TICKS, 2 * STEPS)
+
+
+def test_seeds_apart_make_the_ticks_and_tell_how_long_options_last():
+    apart = processes.SeedsApart(partial(envs.make_env, "nav2d"), TINY, 3, options_config("fixed", "open", 2))
+    apart()
+    apart()
+    assert apart.ticks == 3 * TICKS and 4.0 < apart.duration < 6.0  # a rollout ends in the middle of an option
+
+
+def test_seeds_apart_that_fail_are_told():
+    with pytest.raises(RuntimeError, match="has failed"):
+        processes.SeedsApart(partial(envs.make_env, "nowhere"), TINY, 2)()
 
 
 @pytest.mark.parametrize("task", sorted(peers.GYMNASIUM))
