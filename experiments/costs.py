@@ -1,7 +1,10 @@
 """Where the time of an iteration goes, and how the time of a tick grows with what may grow by a factor of 16."""
 
-from collections.abc import Iterator
+import itertools
+import tempfile
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -9,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
 from taic_jax import envs
+from taic_jax.checkpoint import Checkpoints
 from taic_jax.config import PPOConfig
 from taic_jax.experiments.loops import (
     Training,
@@ -45,6 +49,44 @@ def shares(env: envs.Env, config: PPOConfig, rounds: int) -> dict[str, float]:
     for name, speed in speeds.items():
         taken[name], before = 1.0 / speed.median - before, 1.0 / speed.median
     return {name: value / before for name, value in taken.items()}
+
+
+class Saved:
+    """Iterations of training with a checkpoint after each, written while the next is computed, as a run has them.
+
+    Args:
+      training: makes the iterations.
+      folder: takes the checkpoints; without one, none are made.
+    """
+
+    ITERATIONS = 10
+    """A call's; the last checkpoint is waited for."""
+
+    def __init__(self, training: Training, folder: Path | None = None):
+        self.ticks = self.ITERATIONS * training.ticks
+        self._training, self._count = training, itertools.count(1)
+        self._checkpoints = Checkpoints(folder) if folder else None
+
+    def __call__(self) -> None:
+        """Train for ten iterations more than before."""
+        for _ in range(self.ITERATIONS):
+            self._training()
+            if self._checkpoints:
+                self._checkpoints.save(next(self._count), self._training.state)
+        if self._checkpoints:
+            self._checkpoints.wait()
+
+
+def saving(env: envs.Env, config: PPOConfig, counts: Sequence[int], rounds: int) -> dict[int, float]:
+    """Return, by the number of seeds, which share of the time without checkpoints one after each iteration adds."""
+    shares = {}
+    for seeds in counts:
+        training = Training(env, IdentityExecutor(env.action_size), config, seeds)
+        with tempfile.TemporaryDirectory() as folder:
+            loops = {"without": Saved(training), "with": Saved(training, Path(folder))}
+            speeds = take_turns([Loop(name, loop, loop.ticks) for name, loop in loops.items()], rounds)
+        shares[seeds] = speeds["without"].ratio(speeds["with"]) - 1.0
+    return shares
 
 
 class Widened(envs.Wrapper):

@@ -110,19 +110,19 @@ class Training:
         step = partial(ppo.iterate, arrays, env, executor, ITERATIONS)
         init = partial(ppo.init, arrays, env, executor)
         state = jax.jit(jax.vmap(init) if seeds > 1 else lambda keys: init(keys[0]))(keys)
-        self._state = devices.place(state)
+        self.state = devices.place(state)
         iterate = jax.vmap(lambda state: step(state)[:2]) if seeds > 1 else lambda state: step(state)[:2]
-        self._step = devices.compile(iterate, self._state, donate=True)
+        self._step = devices.compile(iterate, self.state, donate=True)
 
     def __call__(self) -> None:
         """Train for one iteration more than before."""
-        self._state, metrics = jax.block_until_ready(self._step(self._state))
+        self.state, metrics = jax.block_until_ready(self._step(self.state))
         self.duration = float(jnp.mean(metrics["duration"]))
 
     @property
     def gradient_steps(self) -> int:
         """How many gradient steps each seed has taken so far."""
-        counts = [leaf for leaf in jax.tree.leaves(self._state.optimizer) if jnp.issubdtype(leaf.dtype, jnp.integer)]
+        counts = [leaf for leaf in jax.tree.leaves(self.state.optimizer) if jnp.issubdtype(leaf.dtype, jnp.integer)]
         return int(counts[0].reshape(-1)[0])
 
 

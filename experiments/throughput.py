@@ -22,7 +22,7 @@ from taic_jax.config import ConfigError, PPOConfig
 from taic_jax.config_io import load_config, preset_names
 from taic_jax.envs.errors import MissingExtraError
 from taic_jax.experiments import peers
-from taic_jax.experiments.costs import scaling, shares
+from taic_jax.experiments.costs import saving, scaling, shares
 from taic_jax.experiments.loops import (
     WORK,
     Training,
@@ -69,6 +69,8 @@ class Arguments:
     """Rounds in which each loop runs once; the table tells medians."""
     starts: bool = False
     """Measure too how long a run takes to its first logged iteration, with an empty and a filled cache of programs."""
+    checkpoints: bool = False
+    """Measure too what a checkpoint after each iteration costs, at one seed and at several."""
     scaling: bool = False
     """Measure too what a tick costs as environments, seeds, option length and observation size grow by 16."""
     sweep: bool = False
@@ -205,6 +207,11 @@ def report(arguments: Arguments) -> dict[str, Any]:
         figures[name] = rows.get(name, {}).get("ticks_per_second")
     figures |= {"task": arguments.task, "rows": rows, "shares": shares(env, arguments.training, arguments.rounds)}
     show(figures)
+    if arguments.checkpoints:
+        counts = sorted({1, arguments.seeds})
+        figures["checkpoints"] = saving(env, arguments.training, counts, arguments.rounds)
+        for seeds, share in figures["checkpoints"].items():
+            print(f"a checkpoint after each iteration, {seeds} seeds: {share:+.1%} time")
     if arguments.scaling:
         figures["scaling"] = []
         for cost in scaling(env, arguments.training, arguments.steps, arguments.rounds):

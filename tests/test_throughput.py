@@ -9,9 +9,10 @@ import jax
 import pytest
 
 from taic_jax import envs
+from taic_jax.checkpoint import Checkpoints
 from taic_jax.config import ConfigError, PPOConfig
 from taic_jax.experiments import peers, processes, throughput
-from taic_jax.experiments.costs import SMALLEST, Widened, scaling, shares
+from taic_jax.experiments.costs import SMALLEST, Saved, Widened, scaling, shares
 from taic_jax.experiments.loops import WORK, Training, options_config
 from taic_jax.experiments.peers import brax_ppo
 from taic_jax.experiments.processes import Sweep, sweep_costs
@@ -164,6 +165,15 @@ def test_peers_that_are_missing_are_told(monkeypatch):
     loops, remarks = throughput.peer_loops(arguments)
     assert not loops
     assert all("pip install 'taic-jax[peers]'" in remark for remark in remarks.values())
+
+
+def test_training_is_saved_after_each_iteration(tmp_path):
+    training = Training(envs.make_env("nav2d"), IdentityExecutor(2), TINY)
+    saved = Saved(training, tmp_path)
+    saved()
+    checkpoints = Checkpoints(tmp_path)
+    assert checkpoints.latest_step() == Saved.ITERATIONS and saved.ticks == Saved.ITERATIONS * TICKS
+    assert int(checkpoints.load(Saved.ITERATIONS, training.state).iteration) == Saved.ITERATIONS
 
 
 def test_a_task_without_an_engine_has_no_such_row():
