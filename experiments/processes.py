@@ -7,11 +7,10 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
-from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
 
 import jax
 
@@ -132,39 +131,46 @@ class Sweep:
         """Return the points, equally far apart in the logarithm."""
         return [replace(self.config, learning_rate=1e-4 * 100 ** (i / self.points)) for i in range(self.points)]
 
+    def rows(self) -> tuple[PPOConfig, jax.Array]:
+        """Return the config and the key of every run, as arrays [points x seeds]."""
+        return as_rows(self.configs(), self.seeds), jax.random.split(jax.random.key(0), self.points * self.seeds)
+
+    def train(self) -> Callable[[PPOConfig, jax.Array], jax.Array]:
+        """Return what does one run, and returns its curve."""
+        env = envs.make_env(self.task)
+        executor = IdentityExecutor(env.action_size)
+        return lambda config, key: ppo.train(config, env, executor, key, self.ticks)[1]["return"]
+
 
 def sweep_costs(sweep: Sweep, runs: int) -> dict[str, int | float]:
     """Return the seconds of a sweep in one program, in a loop over a compiled run, and in separate processes.
 
     The first is measured whole; of the others `runs` runs each, counted up to all of them. Processes run as many at a
-    time as there are cores, with a filled cache. Compilation, which the first two do once, is told apart.
+    time as there are cores, with a filled cache. Compilation, which the first two do once, is told apart; the first
+    splits its rows over devices, as a sweep does.
     """
-    env = envs.make_env(sweep.task)
-    rows, total = as_rows(sweep.configs(), sweep.seeds), sweep.points * sweep.seeds
-    keys, train = jax.random.split(jax.random.key(0), total), partial(_train, env, sweep.ticks)
-    each = [(jax.tree.map(lambda x, i=i: x[i], rows), keys[i]) for i in range(total)]
-    told: dict[str, int | float] = {"runs": total, "runs_measured": runs}
-    programs: dict[str, Any] = {}
-    for name, function, arguments in (("one_program", jax.vmap(train), (rows, keys)), ("loop", train, each[0])):
-        begun = time.perf_counter()
-        programs[name] = jax.jit(function).lower(*arguments).compile()
-        told[f"compile_{name}"] = time.perf_counter() - begun
+    told: dict[str, int | float] = {"runs": (total := sweep.points * sweep.seeds), "runs_measured": runs}
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:  # with devices of its own
+        told["compile_one_program"], told["one_program"] = pool.submit(_one_program, sweep).result()
+    rows, keys = sweep.rows()
+    each = [(jax.tree.map(lambda x, i=i: x[i], rows), keys[i]) for i in range(runs)]
+    begun = time.perf_counter()
+    program = jax.jit(sweep.train()).lower(*each[0]).compile()
+    told["compile_loop"] = time.perf_counter() - begun
+    told["loop"] = seconds(lambda: [jax.block_until_ready(program(*run)) for run in each]) * total / runs
     _processes(sweep, 1)  # fills the cache
     cores = num_physical_cores()
     rounds = max(1, runs // cores)
-
-    def loop() -> None:
-        for run in each[:runs]:
-            jax.block_until_ready(programs["loop"](*run))
-
-    told["one_program"] = seconds(lambda: jax.block_until_ready(programs["one_program"](rows, keys)))
-    told["loop"] = seconds(loop) * total / runs
     told["processes"] = seconds(lambda: [_processes(sweep, cores) for _ in range(rounds)]) * total / (rounds * cores)
     return told
 
 
-def _train(env: envs.Env, ticks: int, config: PPOConfig, key: jax.Array) -> jax.Array:
-    return ppo.train(config, env, IdentityExecutor(env.action_size), key, ticks)[1]["return"]
+def _one_program(sweep: Sweep) -> tuple[float, float]:
+    """Run a sweep as one program, its rows split over devices; return the seconds of compilation and of the rest."""
+    devices = Devices(open_devices("auto", sweep.points * sweep.seeds))
+    begun, arguments = time.perf_counter(), devices.place(sweep.rows())
+    program = devices.compile(lambda arguments: jax.vmap(sweep.train())(*arguments), arguments)
+    return time.perf_counter() - begun, seconds(lambda: jax.block_until_ready(program(arguments)))
 
 
 def _processes(sweep: Sweep, count: int) -> None:
@@ -181,5 +187,4 @@ def run_alone(sweep: Sweep, point: int) -> None:
     """Run one seed of one point of a sweep in this process."""
     keep_programs()
     config = as_arrays(sweep.configs()[point])
-    train = jax.jit(partial(_train, envs.make_env(sweep.task), sweep.ticks))
-    jax.block_until_ready(train(config, jax.random.key(point)))
+    jax.block_until_ready(jax.jit(sweep.train())(config, jax.random.key(point)))
