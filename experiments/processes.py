@@ -32,30 +32,34 @@ POLL = 0.02
 
 
 def starts(task: str) -> dict[str, float]:
-    """Return the seconds to the first logged iteration of a run, with an empty cache of programs and with a filled one.
+    """Return the seconds to the next logged iteration: with no programs in the cache, with them, and resumed with them.
 
     Raises:
       RuntimeError: a run ended, or logged nothing.
     """
     with tempfile.TemporaryDirectory() as folder:
-        return {name: _first_iteration(task, Path(folder), name) for name in ("cold", "warm")}
+        cold, warm = Path(folder) / "cold-run", Path(folder) / "warm-run"
+        runs = {"cold": (cold,), "warm": (warm,), "resumed": (warm, "--resume")}
+        return {name: _next_iteration(task, Path(folder), *run) for name, run in runs.items()}
 
 
-def _first_iteration(task: str, folder: Path, name: str) -> float:
-    """Start a run whose cache is in the folder, wait for the first row of its metrics, and stop it."""
+def _next_iteration(task: str, folder: Path, run_dir: Path, *options: str) -> float:
+    """Start a run whose cache is in the folder, wait for the next row of its metrics, and stop it at a checkpoint."""
     environment = {key: value for key, value in os.environ.items() if not key.startswith("JAX_COMPILATION_CACHE")}
     environment |= {"XDG_CACHE_HOME": str(folder / "cache")}
-    command = [sys.executable, "-m", "taic_jax.run", task, "--run-dir", str(folder / name)]
+    command = [sys.executable, "-m", "taic_jax.run", task, "--run-dir", str(run_dir), *options]
+    rows = run_dir / "metrics.jsonl"
+    before = len(read_metrics(rows)) if rows.is_file() else 0
     begun = time.perf_counter()
     with subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as run:
         try:
-            while not (rows := folder / name / "metrics.jsonl").is_file() or not read_metrics(rows):
+            while not rows.is_file() or len(read_metrics(rows)) <= before:
                 if run.poll() is not None or time.perf_counter() - begun > PATIENCE:
                     raise RuntimeError(f"{' '.join(command)} logged nothing: exit code {run.poll()}")
                 time.sleep(POLL)
             return time.perf_counter() - begun
         finally:
-            run.kill()
+            run.terminate()
 
 
 class SeedsApart:

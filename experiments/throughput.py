@@ -68,7 +68,8 @@ class Arguments:
     rounds: int = 5
     """Rounds in which each loop runs once; the table tells medians."""
     starts: bool = False
-    """Measure too how long a run takes to its first logged iteration, with an empty and a filled cache of programs."""
+    """Measure too how long a run takes to its first logged iteration, with an empty and a filled cache of programs, and
+    resumed."""
     checkpoints: bool = False
     """Measure too what a checkpoint after each iteration costs, at one seed and at several."""
     scaling: bool = False
@@ -238,7 +239,7 @@ def show(figures: dict[str, Any]) -> None:
         print(f"{name:32} {texts[0]:>12} {texts[1]:>10} {texts[2]:>8} {texts[3]:>11}   {told['remark']}".rstrip())
     print("share of an iteration:", ", ".join(f"{name} {share:.0%}" for name, share in figures["shares"].items()))
     for name, value in figures.get("starts", {}).items():
-        print(f"{name} start to the first logged iteration: {value:.1f} s")
+        print(f"{name} start to the next logged iteration: {value:.1f} s")
 
 
 def show_sweep(told: dict[str, int | float]) -> None:

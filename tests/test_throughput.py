@@ -7,15 +7,17 @@ from functools import partial
 import gymnasium
 import jax
 import pytest
+from tiny_runs import CONFIG, with_fields
 
 from taic_jax import envs
 from taic_jax.checkpoint import Checkpoints
 from taic_jax.config import ConfigError, PPOConfig
+from taic_jax.config_io import to_yaml
 from taic_jax.experiments import peers, processes, throughput
 from taic_jax.experiments.costs import SMALLEST, Saved, Widened, scaling, shares
 from taic_jax.experiments.loops import WORK, Training, options_config
 from taic_jax.experiments.peers import brax_ppo
-from taic_jax.experiments.processes import Sweep, sweep_costs
+from taic_jax.experiments.processes import Sweep, starts, sweep_costs
 from taic_jax.experiments.turns import Loop, Speeds, take_turns
 from taic_jax.options.execution import IdentityExecutor
 
@@ -209,6 +211,18 @@ def test_a_sweep_is_counted_up_from_what_was_measured(monkeypatch):
     told = sweep_costs(Sweep("nav2d", 4, 2, TICKS, TINY), 4)
     assert asked == [1, 2, 2]
     assert (told["loop"], told["processes"]) == (2.0, 2.0) and told["one_program"] > 0
+
+
+def test_a_resumed_start_goes_on_with_the_run(tmp_path):
+    path = tmp_path / "long.yaml"
+    path.write_text(to_yaml(with_fields(CONFIG, collect__ticks=10_000_000)))
+    told = starts(str(path))
+    assert list(told) == ["cold", "warm", "resumed"] and all(seconds > 0 for seconds in told.values())
+
+
+def test_a_start_that_fails_is_told():
+    with pytest.raises(RuntimeError, match="logged nothing: exit code 2"):
+        starts("no_such_preset")
 
 
 def test_points_of_a_sweep_differ():
