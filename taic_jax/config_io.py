@@ -33,12 +33,16 @@ def _load(source: str, above: tuple[str, ...]) -> Config:
         changes = _read_changes(source)
     except ConfigError as error:
         raise (ConfigError(f"{above[-1]}: base: {error}") if above else error) from None
-    if BASE not in changes:
-        return _override(Config(), changes)
-    base = changes.pop(BASE)
-    if not isinstance(base, str):
-        raise ConfigError(f"{source}: base: expected a preset's name or a file, got {_show(base)}")
-    return _override(_load(base, (*above, source)), changes)
+    config = Config()
+    if BASE in changes:
+        base = changes.pop(BASE)
+        if not isinstance(base, str):
+            raise ConfigError(f"{source}: base: expected a preset's name or a file, got {_show(base)}")
+        config = _load(base, (*above, source))
+    try:
+        return _override(config, changes)
+    except ConfigError as error:
+        raise ConfigError(f"{source}: {error}") from None
 
 
 def _read_changes(source: str) -> dict:

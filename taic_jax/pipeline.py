@@ -17,7 +17,7 @@ from taic_jax.config import COLLECT, Config, ConfigError, OptionsConfig, Shard, 
 from taic_jax.devices import make_devices
 from taic_jax.envs import environment_options, make_env
 from taic_jax.envs.base import Env
-from taic_jax.envs.errors import RenderingError
+from taic_jax.envs.errors import RenderingError, UnknownNameError
 from taic_jax.experience import EXPERIENCE, ExperienceStore, gather_experience, num_blocks
 from taic_jax.files import save_text
 from taic_jax.guard import FINITE
@@ -97,14 +97,18 @@ def make_envs(config: Config) -> tuple[Env, Env]:
     """Return the task and the environment that experience is collected in.
 
     Raises:
-      ConfigError: options learnt in one do not fit the other.
+      ConfigError: there is no such environment, or options learnt in one do not fit the other.
     """
     options = dataclasses.asdict(config.env)
-    name = options.pop("name")
-    env = source = make_env(name, **options)
-    if config.collect.env:
-        kept = ("backend", "num_threads", *environment_options(config.collect.env))
-        source = make_env(config.collect.env, **{option: options[option] for option in kept})
+    field, name = "env.name", options.pop("name")
+    try:
+        env = source = make_env(name, **options)
+        if config.collect.env:
+            field, name = "collect.env", config.collect.env
+            kept = ("backend", "num_threads", *environment_options(name))
+            source = make_env(name, **{option: options[option] for option in kept})
+    except UnknownNameError as error:
+        raise ConfigError(f"{field}: {error}") from None
     bodies = [(*describe(e).values(),)[1:] for e in (source, env)]
     if bodies[0] != bodies[1]:
         raise ConfigError(
@@ -228,8 +232,7 @@ def collect(run: Run, env: Env) -> Trained:
 def learn(run: Run, env: Env) -> OptionModel:
     """Learn one option model per seed from the experience and save it as the artifact `options`."""
     config, dataset = run.config.options, select_windows(run, env)
-    networks = make_networks(config, env.proprioceptive_size, env.action_size)
-    init, steps = learn_over_rows(config, networks)
+    init, steps = learn_over_rows(config, make_networks(config, env.proprioceptive_size, env.action_size))
     state = jax.jit(init)(config, run.stage_keys("learn"))
     if config.steps:  # with none, D stays as random as it was drawn
         unit = steps_per_log(config)

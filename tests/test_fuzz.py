@@ -87,13 +87,14 @@ def names_a_field(told: str) -> bool:
 def names(told: str, what: str) -> bool:
     """Tell whether a message names this, and not only what has it in its name; every blank is told as one."""
     what = " ".join(what.split())
-    return bool(what) and bool(re.search(rf"(?<![\w.]){re.escape(what)}(?![\w])", told))
+    return bool(what) and bool(re.search(rf"(?<![\w.]){re.escape(what)}(?!\w|\.\w)", told))
 
 
 def leaves(document: Any, prefix: str = "") -> Iterator[str]:
-    """Yield the dotted name of every value of a document that should be no mapping, or is none, or an empty one."""
-    if prefix[:-1] in (*FIELDS, "base") or not isinstance(document, dict) or not document:
+    """Yield the dotted name of every value of a document, and of what holds it, which may be what is unknown."""
+    if prefix:
         yield prefix[:-1]
+    if prefix[:-1] in (*FIELDS, "base") or not isinstance(document, dict):
         return
     for key, value in document.items():
         yield from leaves(value, f"{prefix}{key}.")
@@ -129,7 +130,8 @@ def test_what_counts_as_naming_a_field():
     assert names("env.name: expected", "env.name") and not names("env.names: expected", "env.name")
     assert not names("collect.seed: expected", "seed") and not names("something", "")
     assert names_a_field("unknown field opt; the nearest is options.size") and not names_a_field("the environment")
-    assert list(leaves({"env": {"name": 1, "b": {}}, "seed": {"a": 2}})) == ["env.name", "env.b", "seed"]
+    assert list(leaves({"env": {"name": 1, "b": {}}, "seed": {"a": 2}})) == ["env", "env.name", "env.b", "seed"]
+    assert not names("unknown field env.b", "env")
 
 
 MARKS = st.sampled_from(["seed", ":", " ", "\n", "-", "{", "&a", "*a", "<<", "train", "[", "1"])
