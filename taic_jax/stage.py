@@ -187,7 +187,7 @@ def drive(
             if after is not None:
                 after(index, run.rows(extra))
             run.clock.ticks += ticks
-            if changed := (codes != known).any():
+            if changed := bool((codes != known).any()):
                 known = run.stop(stage, run.rows(guard), unit, known)
             due = changed or index + 1 == num_steps or time.perf_counter() - saved > run.checkpoint_seconds
             due, received = agree([due, run.signals.received or 0])
