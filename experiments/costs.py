@@ -22,6 +22,7 @@ from taic_jax.experiments.loops import (
     options_config,
     stepping,
     untrained_rollout,
+    untrained_ticks,
 )
 from taic_jax.experiments.turns import Loop, take_turns
 from taic_jax.options.execution import IdentityExecutor
@@ -156,6 +157,5 @@ def _at(env: envs.Env, config: PPOConfig, steps: int, axis: str, value: int) -> 
         return Training(env, flat, config, value)
     if axis == "observation size":
         return Training(Widened(env, max(value, env.observation_size)), flat, config)
-    compiled, begin = untrained_rollout(env, config.num_envs, config.rollout_length)
     options = options_config("fixed", "open", steps, length=value)
-    return Training(env, learnt_executor(env, compiled(begin)[1], options), config)
+    return Training(env, learnt_executor(env, untrained_ticks(env), options), config)

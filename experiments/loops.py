@@ -28,6 +28,8 @@ WORK = PPOConfig(num_envs=64, rollout_length=256, epochs=10, minibatch_size=512)
 """What an iteration of training is everywhere here: 64 x 256 ticks, 10 epochs of 32 minibatches, 64x64 networks."""
 VARIABLE_LENGTH = 10
 """The most ticks that options take which may end earlier: those of termination fixed are 5 ticks long."""
+SEEN = 16, 1024
+"""Environments, and ticks of each, that options are learnt from."""
 ONE_DEVICE = Devices()
 ITERATIONS = 100
 """Of which one is measured; the step size decays over them."""
@@ -124,6 +126,12 @@ class Training:
         """How many gradient steps each seed has taken so far."""
         counts = [leaf for leaf in jax.tree.leaves(self.state.optimizer) if jnp.issubdtype(leaf.dtype, jnp.integer)]
         return int(counts[0].reshape(-1)[0])
+
+
+def untrained_ticks(env: envs.Env) -> Rollout:
+    """Return ticks [T, B] to learn options from: enough of each environment to hold a part of them out."""
+    compiled, begin = untrained_rollout(env, *SEEN)
+    return compiled(begin)[1]
 
 
 def learnt_executor(env: envs.Env, ticks: Rollout, config: OptionsConfig) -> OptionExecutor:

@@ -19,7 +19,7 @@ from taic_jax.compilation import keep_programs
 from taic_jax.config import OptionsConfig, PPOConfig
 from taic_jax.devices import Devices, open_devices
 from taic_jax.envs.physics.mujoco import num_physical_cores
-from taic_jax.experiments.loops import Training, learnt_executor, untrained_rollout
+from taic_jax.experiments.loops import Training, learnt_executor, untrained_ticks
 from taic_jax.experiments.turns import seconds
 from taic_jax.logging import read_metrics
 from taic_jax.options.execution import Executor, IdentityExecutor
@@ -106,8 +106,7 @@ def _serve(
     env = make_env()
     executor: Executor = IdentityExecutor(env.action_size)
     if options is not None:
-        compiled, begin = untrained_rollout(env, config.num_envs, config.rollout_length)
-        executor = learnt_executor(env, compiled(begin)[1], options)
+        executor = learnt_executor(env, untrained_ticks(env), options)
     training = Training(env, executor, config, seeds, Devices(shard))
     while True:
         try:
@@ -159,7 +158,7 @@ def sweep_costs(sweep: Sweep, runs: int) -> dict[str, int | float]:
     rows, keys = sweep.rows()
     each = [(jax.tree.map(lambda x, i=i: x[i], rows), keys[i]) for i in range(runs)]
     begun = time.perf_counter()
-    program = jax.jit(sweep.train()).lower(*each[0]).compile()
+    program = Devices().compile(sweep.train(), *each[0])
     told["compile_loop"] = time.perf_counter() - begun
     told["loop"] = seconds(lambda: [jax.block_until_ready(program(*run)) for run in each]) * total / runs
     _processes(sweep, 1)  # fills the cache
@@ -190,5 +189,5 @@ def _processes(sweep: Sweep, count: int) -> None:
 def run_alone(sweep: Sweep, point: int) -> None:
     """Run one seed of one point of a sweep in this process."""
     keep_programs()
-    config = as_arrays(sweep.configs()[point])
-    jax.block_until_ready(jax.jit(sweep.train())(config, jax.random.key(point)))
+    run = as_arrays(sweep.configs()[point]), jax.random.key(point)
+    jax.block_until_ready(Devices().compile(sweep.train(), *run)(*run))

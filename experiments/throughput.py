@@ -31,6 +31,7 @@ from taic_jax.experiments.loops import (
     learnt_executor,
     options_config,
     untrained_rollout,
+    untrained_ticks,
 )
 from taic_jax.experiments.processes import SeedsApart, Sweep, starts, sweep_costs
 from taic_jax.experiments.turns import Loop, Speeds, take_turns
@@ -98,10 +99,9 @@ def our_loops(arguments: Arguments, env: envs.Env) -> list[Loop]:
     """Return the loops of the engine, the rollout, and training: flat, over options, and of several seeds."""
     ticks = arguments.num_envs * arguments.rollout_length
     compiled, begin = untrained_rollout(env, arguments.num_envs, arguments.rollout_length)
-    seen = compiled(begin)[1]
-    loops = [Loop("engine", bare_engine(env, seen.action), ticks)] if has_engine(env) else []
+    loops = [Loop("engine", bare_engine(env, compiled(begin)[1].action), ticks)] if has_engine(env) else []
     loops.append(Loop("rollout", lambda: jax.block_until_ready(compiled(begin)), ticks))
-    executors = {"flat_training": IdentityExecutor(env.action_size)}
+    seen, executors = untrained_ticks(env), {"flat_training": IdentityExecutor(env.action_size)}
     kinds = [(rule, decoder) for decoder in arguments.decoders for rule in arguments.rules]
     for kind in kinds:
         name = HEADLINE if kind == PAPER else f"{HEADLINE}/{'/'.join(kind)}"
@@ -203,6 +203,8 @@ def report(arguments: Arguments) -> dict[str, Any]:
     figures: dict[str, Any] = {}
     if arguments.starts:  # before this process holds memory and threads
         figures["starts"] = starts(arguments.task)
+        for name, value in figures["starts"].items():
+            print(f"{name} start to the next logged iteration: {value:.1f} s", flush=True)
     rows = measure(arguments, env)
     for name in ("engine", "rollout", "flat_training", HEADLINE):
         figures[name] = rows.get(name, {}).get("ticks_per_second")
@@ -226,7 +228,7 @@ def report(arguments: Arguments) -> dict[str, Any]:
 
 
 def show(figures: dict[str, Any]) -> None:
-    """Print the table of speeds, where the time of an iteration goes, and how long starts take."""
+    """Print the table of speeds, and where the time of an iteration goes."""
     print(f"{figures['task']:32} {'ticks/s':>12} {'of engine':>10} {'of flat':>8} {'first call':>11}")
     for name, told in figures["rows"].items():
         numbers = [
@@ -238,8 +240,6 @@ def show(figures: dict[str, Any]) -> None:
         ]
         print(f"{name:32} {texts[0]:>12} {texts[1]:>10} {texts[2]:>8} {texts[3]:>11}   {told['remark']}".rstrip())
     print("share of an iteration:", ", ".join(f"{name} {share:.0%}" for name, share in figures["shares"].items()))
-    for name, value in figures.get("starts", {}).items():
-        print(f"{name} start to the next logged iteration: {value:.1f} s")
 
 
 def show_sweep(told: dict[str, int | float]) -> None:

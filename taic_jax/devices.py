@@ -11,6 +11,7 @@ import numpy as np
 from jax.sharding import AxisType, Mesh, NamedSharding
 from jax.sharding import PartitionSpec as Spec
 
+from taic_jax.compilation import compiler_options
 from taic_jax.config import Config, ConfigError, Shard
 from taic_jax.envs.physics.mujoco import num_physical_cores
 from taic_jax.hosts import ALONE, Hosts, join, on_this_host
@@ -61,13 +62,13 @@ class Devices:
         """Compile a function of rows and to rows for arguments that were placed; the first may be given away."""
         settings: dict[str, Any] = {"donate_argnums": 0 if donate else ()}
         if self.shard == "none":
-            return jax.jit(function, **settings).lower(*args).compile()
+            return jax.jit(function, **settings).lower(*args).compile(compiler_options=compiler_options())
         if self.shard == SEEDS:
             spec = self._spec
             function = jax.shard_map(function, mesh=self.mesh, in_specs=spec, out_specs=spec, check_vma=False)
         with jax.set_mesh(self.mesh):
             settings["out_shardings"] = NamedSharding(self.mesh, self._spec)
-            return jax.jit(function, **settings).lower(*args).compile()
+            return jax.jit(function, **settings).lower(*args).compile(compiler_options=compiler_options())
 
     def _fill(self, x: Any) -> Any:
         missing = -len(x) % self.mesh.size

@@ -26,7 +26,7 @@ TICKS, STEPS = 32, 4
 SMALL = [
     "--training.num-envs", "2", "--training.rollout-length", "16", "--training.epochs", "2",
     "--training.minibatch-size", "16", "--training.hidden-sizes", "4", "--num-envs", "4", "--rollout-length", "16",
-    "--rounds", "1", "--steps", "2", "--rules", "fixed", "--decoders", "open",
+    "--rounds", "1", "--steps", "2", "--rules", "fixed", "predict", "--decoders", "open",
 ]  # fmt: skip
 
 
@@ -73,12 +73,11 @@ def test_gymnasium_environments_look_like_ours(task):
     assert gymnasium.make(name, **options).observation_space.shape == (env.observation_size,)
 
 
-@pytest.mark.parametrize("workers", ["DummyVecEnv", "SubprocVecEnv"])
-def test_stable_baselines_does_the_same_work(workers):
+def test_stable_baselines_does_the_same_work():
     pytest.importorskip("stable_baselines3")
     from taic_jax.experiments.peers.stable_baselines import StableBaselines
 
-    peer = StableBaselines("HalfCheetah-v5", {}, TINY, workers, 1)
+    peer = StableBaselines("HalfCheetah-v5", {}, TINY, 1)
     peer()
     peer()
     assert (peer.ticks, peer.made, peer.gradient_steps) == (TICKS, 2 * TICKS, 2 * STEPS)
@@ -151,7 +150,8 @@ def test_table_and_json_hold_what_is_promised(tmp_path, capsys):
     told = json.loads(out.read_text())
     assert all(told[name] > 0 for name in ("engine", "rollout", "flat_training", "option_training"))
     assert sorted(told["rows"]) == [
-        "engine", "flat_training", "flat_training/2 seeds", "option_training", "option_training/2 seeds", "rollout",
+        "engine", "flat_training", "flat_training/2 seeds", "option_training", "option_training/2 seeds",
+        "option_training/predict/open", "rollout",
     ]  # fmt: skip
     assert told["rows"]["option_training"]["remark"].startswith("5.")
     assert list(told["shares"]) == ["physics", "transfer", "policy", "update"]

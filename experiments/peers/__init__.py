@@ -60,7 +60,9 @@ def fastest(candidates: Iterable[tuple[str, Callable[[], Any]]]) -> Tuned:
 
 
 def make_stable_baselines(task: str, config: PPOConfig) -> Tuned:
-    """Return Stable-Baselines3's PPO, in one process or one per environment, with one thread or as many as cores.
+    """Return Stable-Baselines3's PPO, with one thread of PyTorch's or as many as cores.
+
+    In one process: its other way is a process per environment, and 64 of them do not fit in 24 GiB.
 
     Raises:
       MissingExtraError: it is not installed.
@@ -68,15 +70,10 @@ def make_stable_baselines(task: str, config: PPOConfig) -> Tuned:
     with extra("peers"):
         from taic_jax.experiments.peers.stable_baselines import StableBaselines
 
-    def candidates() -> Iterable[tuple[str, Callable[[], StableBaselines]]]:
-        for workers in ("DummyVecEnv", "SubprocVecEnv"):
-            for threads in thread_counts():
-                yield (
-                    f"{workers}, {threads} threads",
-                    lambda w=workers, t=threads: StableBaselines(*GYMNASIUM[task], config, w, t),
-                )
-
-    return fastest(candidates())
+    return fastest(
+        (f"{threads} threads", lambda t=threads: StableBaselines(*GYMNASIUM[task], config, t))
+        for threads in thread_counts()
+    )
 
 
 def make_envpool(task: str, config: PPOConfig) -> Tuned:

@@ -5,11 +5,9 @@ from typing import Any
 import gymnasium
 import torch
 from stable_baselines3 import PPO
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from taic_jax.config import PPOConfig
-
-WORKERS = {"DummyVecEnv": DummyVecEnv, "SubprocVecEnv": SubprocVecEnv}
 
 
 class StableBaselines:
@@ -19,15 +17,12 @@ class StableBaselines:
       name: the environment's in Gymnasium.
       options: of `gymnasium.make`.
       config: the work.
-      workers: a key of `WORKERS`.
       threads: of PyTorch.
     """
 
-    def __init__(self, name: str, options: dict[str, Any], config: PPOConfig, workers: str, threads: int):
+    def __init__(self, name: str, options: dict[str, Any], config: PPOConfig, threads: int):
         self.ticks, self._threads = config.num_envs * config.rollout_length, threads
-        # Where processes inherit nothing, or else they would inherit JAX's threads in the middle of what they do.
-        start = {"start_method": "forkserver"} if workers == "SubprocVecEnv" else {}
-        self._envs = WORKERS[workers]([lambda: gymnasium.make(name, **options)] * config.num_envs, **start)
+        self._envs = DummyVecEnv([lambda: gymnasium.make(name, **options)] * config.num_envs)
         sizes = list(config.hidden_sizes)
         self._model = PPO(
             "MlpPolicy", self._envs, learning_rate=config.learning_rate, n_steps=config.rollout_length,
