@@ -132,8 +132,14 @@ class Run:
         return compiled
 
 
-def _resume(checkpoints: Checkpoints, guard: Guarded) -> tuple[Guarded, int]:
-    """Return the last checkpoint that every host sees, and its step; without one, what is given, and 0."""
+def resume(checkpoints: Checkpoints, guard: Guarded) -> tuple[Guarded, int]:
+    """Return the last checkpoint that every host sees, and its step; without one, what is given, and 0.
+
+    Types are never weak, as a checkpoint's are not: the program compiled at the start is the one that resumes.
+    """
+    guard = jax.tree.map(
+        lambda x: jax.lax.convert_element_type(x, x.dtype) if getattr(x, "weak_type", False) else x, guard
+    )
     (step,) = agree([checkpoints.latest_step() or 0], least=True)
     return checkpoints.load(step, guard) if step else guard, step
 
@@ -170,7 +176,7 @@ def drive(
       SaveError: something cannot be written; the checkpoints before are still there.
     """
     checkpoints = Checkpoints(run.dir / "checkpoints" / stage)
-    guard, first = _resume(checkpoints, begin(state, run.inherited(stage)))
+    guard, first = resume(checkpoints, begin(state, run.inherited(stage)))
     run.clock.ticks += first * ticks
     run.logger.truncate(stage, first * unit)
     known = run.stop(stage, guard, unit)

@@ -8,13 +8,16 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import pytest
 from tiny_runs import CONFIG, KilledError, die, tiny_steps, with_fields
 
 from taic_jax.checkpoint import Checkpoints
 from taic_jax.compilation import keep_programs
 from taic_jax.config import Config
+from taic_jax.guard import begin
 from taic_jax.pipeline import run_pipeline
+from taic_jax.stage import resume
 
 HIT, MISS = "/jax/compilation_cache/cache_hits", "/jax/compilation_cache/cache_misses"
 STEP = """
@@ -56,6 +59,13 @@ def test_other_values_and_seeds_and_a_run_that_goes_on_compile_nothing(events, t
         events.clear()
         run_in_two_parts(changed, tmp_path / "second")
     assert events[MISS] == 0 < events[HIT]
+
+
+def test_a_run_begins_with_the_types_that_it_resumes_with(tmp_path):
+    guard = begin({"weak": jnp.asarray(1.0)[None]}, jnp.zeros(1, jnp.int32))
+    assert guard.state["weak"].weak_type
+    resumed, step = resume(Checkpoints(tmp_path), guard)
+    assert step == 0 and not resumed.state["weak"].weak_type
 
 
 def test_a_program_with_physics_is_found_by_another_process(tmp_path):
