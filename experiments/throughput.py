@@ -110,9 +110,10 @@ def our_loops(arguments: Arguments, env: envs.Env) -> list[Loop]:
         training = Training(env, executor, arguments.training)
         loops.append(Loop(name, training, training.ticks))
     several = {"flat_training": None, HEADLINE: options_config(*PAPER, arguments.steps)}
-    for name in [name for name in several if name in executors and arguments.seeds > 1]:
-        training = SeedsApart(partial(make_env, arguments), arguments.training, arguments.seeds, several[name])
-        loops.append(Loop(f"{name}/{arguments.seeds} seeds", training, training.ticks))
+    for name, options in several.items():
+        if name in executors and arguments.seeds > 1:
+            training = SeedsApart(partial(make_env, arguments), arguments.training, arguments.seeds, options)
+            loops.append(Loop(f"{name}/{arguments.seeds} seeds", training, training.ticks))
     return loops
 
 

@@ -46,16 +46,12 @@ class Devices:
             return rows
         if self.shard == SEEDS:
             rows = jax.tree.map(self._fill, rows)
-        sharding = NamedSharding(self.mesh, self._spec)
-        if jax.process_count() > 1:  # where `device_put` takes only devices of this host
-            return jax.jit(lambda rows: rows, out_shardings=sharding)(rows)
-        return jax.device_put(rows, sharding)
+        return self._send(rows, self._spec)
 
     def take(self, rows: Tree, count: int) -> Tree:
         """Return the first `count` rows, all but those that `place` added, on every host."""
         if jax.process_count() > 1:
-            rows = jax.jit(lambda rows: rows, out_shardings=NamedSharding(self.mesh, Spec()))(rows)
-            rows = jax.tree.map(on_this_host, rows)
+            rows = jax.tree.map(on_this_host, self._send(rows, Spec()))
         return jax.tree.map(lambda x: x if len(x) == count else x[:count], rows)
 
     def compile(self, function: Callable, *args: Any, donate: bool = False) -> Callable:
@@ -70,9 +66,20 @@ class Devices:
             settings["out_shardings"] = NamedSharding(self.mesh, self._spec)
             return jax.jit(function, **settings).lower(*args).compile(compiler_options=compiler_options())
 
+    def _send(self, rows: Tree, spec: Spec) -> Tree:
+        sharding = NamedSharding(self.mesh, spec)
+        if jax.process_count() > 1:  # where `device_put` takes only devices of this host
+            return jax.jit(_same, out_shardings=sharding)(rows)
+        return jax.device_put(rows, sharding)
+
     def _fill(self, x: Any) -> Any:
         missing = -len(x) % self.mesh.size
         return x[np.minimum(np.arange(len(x) + missing), len(x) - 1)] if missing else x
+
+
+def _same(rows: Tree) -> Tree:
+    """Return rows as they are; one function for all calls, or each of them would be compiled."""
+    return rows
 
 
 def open_devices(shard: Shard, rows: int, hosts: Hosts = ALONE) -> Shard:

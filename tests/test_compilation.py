@@ -12,9 +12,11 @@ import jax.numpy as jnp
 import pytest
 from tiny_runs import CONFIG, KilledError, die, tiny_steps, with_fields
 
+from taic_jax import compilation
 from taic_jax.checkpoint import Checkpoints
 from taic_jax.compilation import keep_programs
 from taic_jax.config import Config
+from taic_jax.devices import Devices
 from taic_jax.guard import begin
 from taic_jax.pipeline import run_pipeline
 from taic_jax.stage import resume
@@ -66,6 +68,17 @@ def test_a_run_begins_with_the_types_that_it_resumes_with(tmp_path):
     assert guard.state["weak"].weak_type
     resumed, step = resume(Checkpoints(tmp_path), guard)
     assert step == 0 and not resumed.state["weak"].weak_type
+
+
+def test_products_of_matrices_are_not_left_to_ynnpack():
+    x = jnp.ones((64, 64))
+    assert "__ynn" in jax.jit(lambda x: x @ x).lower(x).compile().as_text()
+    assert "__ynn" not in Devices().compile(lambda x: x @ x, x).as_text()
+
+
+def test_an_option_that_xla_does_not_know_is_left_out(monkeypatch):
+    monkeypatch.setattr(compilation, "WITHOUT_YNNPACK", {"xla_no_such_option": ""})
+    assert compilation.compiler_options.__wrapped__() == {}
 
 
 def test_a_program_with_physics_is_found_by_another_process(tmp_path):
