@@ -1,7 +1,7 @@
 """The table of finished runs, a line of JSON each: what figures are drawn from, and nothing else.
 
 A row is one method on one task for some seeds: what the run was (config and its hash, versions, commit), a curve per
-seed on a common grid of ticks, and the numbers per seed before and after training.
+seed on a common grid of ticks, and the numbers per seed before and after training; of some an example that is drawn.
 """
 
 import dataclasses

@@ -10,7 +10,7 @@ import pytest
 from tiny_runs import CONFIG, PPO, tiny_steps, with_fields
 
 from taic_jax.config import Config
-from taic_jax.experiments import drawing, evidence, figure5c, figure7, figure8
+from taic_jax.experiments import drawing, evidence, figure5c, figure6, figure7, figure8
 from taic_jax.experiments.cells import Cell, all_cells
 from taic_jax.experiments.recovery import AFTER, recovery_of
 from taic_jax.experiments.table import TableError, append_row, config_hash, difference, read_table, row_of, select
@@ -166,7 +166,7 @@ def test_figure_7_marks_what_is_missing(table, tmp_path, monkeypatch):
 
 
 def test_figures_refuse_an_empty_table(table, capsys):
-    for figure in (figure5c, figure7, figure8):
+    for figure in (figure5c, figure6, figure7, figure8):
         with pytest.raises(SystemExit) as error:
             figure.main(["--table", str(table)])
         assert error.value.code == 2
@@ -185,6 +185,32 @@ def test_figure_5c_counts_who_recovered(table, tmp_path):
     figure5c.main(["--table", written(table, *rows), "--out", str(out)])
     lines = out.with_suffix(".csv").read_text().splitlines()
     assert lines[1].startswith("options,50,50,50,50,") and lines[2].startswith("flat,50,50,50,10,")
+
+
+def test_figure_6_draws_what_the_table_holds_and_marks_the_rest(table, tmp_path, monkeypatch):
+    """Of ten models without the constraints and four with them; the example's codes are where its options led to."""
+    points = np.random.default_rng(0).normal(size=(100, 2))
+    rows = []
+    for method, seeds, level in (("fixed-open-none", 10, 0.2), ("predict-open-both", 4, 0.7)):
+        row = made_row("half_cheetah", method, 0, seeds, 1.0)
+        row["numbers"] |= {f"space/{name}": [level] * seeds for name in figure6.MEASURES}
+        rows.append(row | {"example": {"options": points.tolist(), "ends": points.tolist()}})
+    marked, out = {}, tmp_path / "figure6.png"
+    monkeypatch.setattr(figure6, "mark", lambda axes, title, remarks, width: marked.update({title: tuple(remarks)}))
+    figure6.main(["--table", written(table, *rows), "--out", str(out)])
+    assert marked == {"RVAE": (), "Term-output": ("missing",), "Term-predict": ("4 of 10 seeds",)}
+    assert out.stat().st_size > 50_000
+    lines = out.with_suffix(".csv").read_text().splitlines()
+    assert lines[1] == "half_cheetah,fixed-open-none,10,prior/one/distance_correlation,0.2,0.2,0.2,"
+    assert len(lines) == 1 + 2 * len(figure6.MEASURES)
+
+
+def test_colours_of_near_points_are_alike():
+    points = np.array([[0.0, 0.0], [0.1, 0.1], [5.0, 9.0], [5.1, 0.2]])
+    colours = figure6.as_colours(points)
+    np.testing.assert_allclose(colours[0], figure6.CORNERS[0, 0])
+    between = np.linalg.norm(colours[:, None] - colours[None], axis=-1)
+    assert between[0, 1] < between[0, 2] and between[0, 1] < between[0, 3]
 
 
 def test_the_style_of_figures_is_theirs_alone():

@@ -1,0 +1,139 @@
+"""Figure 6: do options that lead to like states have like codes? HalfCheetah, without and with the constraints.
+
+python -m taic_jax.experiments.figure6
+
+Reads the table alone; needs scikit-learn (extra `viz`). As the paper drew it: a point is an option executed from one
+state; its place is t-SNE of the state that the option led to, its colour t-SNE of the option. t-SNE differs with its
+perplexity, hence three of them; and beside it stand measures of the option spaces themselves, over all option models.
+"""
+
+import dataclasses
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+from jaxtyping import Float
+from matplotlib.axes import Axes
+
+from taic_jax.experiments.cells import METHODS, OTHERS
+from taic_jax.experiments.drawing import BLUE, GREY, RESULTS, mark, plt, save, styled
+from taic_jax.experiments.figure7 import write_numbers
+from taic_jax.experiments.spaces import PREFIX
+from taic_jax.experiments.table import TABLE, Runs, TableError, read_table, select
+from taic_jax.statistics import bootstrap_interval, iqm
+
+PANELS = {"fixed-open-none": "RVAE", "output-open-both": "Term-output", "predict-open-both": "Term-predict"}
+PERPLEXITIES = (10, 30, 90)
+MODELS = 10
+MEASURES = {
+    "prior/one/distance_correlation": "distance correlation of\noption and state change",
+    "window/mlp_r2/change": "R² of the state change\nfrom the code",
+    "window/mlp_r2/start": "R² of the first state\nfrom the code",
+}
+CORNERS = np.array([[[0.90, 0.10, 0.20], [0.95, 0.75, 0.10]], [[0.20, 0.25, 0.80], [0.10, 0.75, 0.45]]])
+"""Colours of the four corners of a square."""
+FIELDS = ("task", "method", "models", "measure", "iqm", "low", "high", "remarks")
+
+
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+    """Draw figure 6 and write its numbers."""
+
+    table: Path = TABLE
+    """The table of finished runs."""
+    out: Path = RESULTS / "figure6.png"
+    """The picture; its numbers are written beside it as CSV."""
+    task: str = "half_cheetah"
+    """The robot."""
+
+
+def as_colours(points: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 3"]:
+    """Return a colour for each point, by its ranks along both axes: near points look alike, and all colours occur."""
+    x, y = points.argsort(axis=0).argsort(axis=0).T[..., None] / max(len(points) - 1, 1)
+    low, high = ((1 - y) * CORNERS[i, 0] + y * CORNERS[i, 1] for i in range(2))
+    return (1 - x) * low + x * high
+
+
+def embed(points: Any, perplexity: int) -> Float[np.ndarray, "N 2"]:
+    """Return t-SNE of points [N, D] (van der Maaten & Hinton, 2008), begun at their principal components.
+
+    Raises:
+        TableError: scikit-learn is not installed.
+    """
+    try:
+        from sklearn.manifold import TSNE
+    except ImportError:
+        raise TableError("t-SNE needs scikit-learn: pip install 'taic-jax[viz]'") from None
+    return TSNE(perplexity=perplexity, init="pca", random_state=0).fit_transform(np.asarray(points, np.float32))
+
+
+def numbers(runs: Runs) -> list[dict[str, Any]]:
+    """Return a row for each measure of one kind of options: its mean over option models, with a 95 % interval."""
+    rows = []
+    for name, values in runs.numbers.items():
+        if name.startswith(PREFIX):
+            row = {"task": runs.task, "method": runs.method, "models": len(values), "measure": name[len(PREFIX) :]}
+            row |= dict(zip(("iqm", "low", "high"), (float(iqm(values)), *bootstrap_interval(values)), strict=True))
+            rows.append(row | {"remarks": "; ".join(runs.remarks)})
+    return rows
+
+
+def draw_measure(axes: Axes, name: str, rows: Sequence[dict[str, Any]]) -> None:
+    """Draw one measure of every kind of options, those with the constraints in blue."""
+    shown = [row for row in rows if row["measure"] == name][::-1]
+    for y, row in enumerate(shown):
+        colour = GREY if row["method"].endswith("none") else BLUE
+        axes.plot([row["low"], row["high"]], [y, y], color=colour, linewidth=2)
+        axes.plot(row["iqm"], y, "o", color=colour)
+    axes.set_yticks(range(len(shown)), [row["method"].replace("-", ", ") for row in shown], fontsize=7.5)
+    axes.set_xlabel(MEASURES[name])
+
+
+@styled
+def draw(
+    examples: dict[str, dict[str, Any]], rows: Sequence[dict[str, Any]], remarks: dict[str, Sequence[str]], out: Path
+) -> None:
+    """Draw a column of t-SNE for each of the paper's panels, a row for each perplexity, and the measures beside."""
+    figure, panels = plt.subplots(
+        len(PERPLEXITIES), len(PANELS) + 1, figsize=(13.5, 9.6), width_ratios=[1.0] * len(PANELS) + [1.2]
+    )
+    for line, perplexity in zip(panels, PERPLEXITIES, strict=True):
+        for axes, (method, label) in zip(line[:-1], PANELS.items(), strict=True):
+            axes.set_xticks([])
+            axes.set_yticks([])
+            if method in examples:
+                colours = as_colours(embed(examples[method]["options"], perplexity))
+                axes.scatter(*embed(examples[method]["ends"], perplexity).T, c=colours, s=12)
+            if perplexity == PERPLEXITIES[0]:
+                mark(axes, label, remarks[method], width=36)
+        line[0].set_ylabel(f"perplexity {perplexity}")
+    for axes, name in zip(panels[:, -1], MEASURES, strict=True):
+        draw_measure(axes, name, rows)
+    figure.suptitle("place: t-SNE of the state an option led to; colour: t-SNE of the option", x=0.01, ha="left")
+    save(figure, out)
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Draw the figure and write its numbers."""
+    arguments = tyro.cli(Arguments, args=args)
+    try:
+        table = read_table(arguments.table)
+        held = {row["method"]: row.get("example") for row in table if row["task"] == arguments.task}
+        found = {method: select(table, arguments.task, method, MODELS) for method in METHODS | OTHERS if method in held}
+        rows = [row for runs in found.values() for row in numbers(runs)]
+        if not rows:
+            name = f"{arguments.table}: no row of figure 6"
+            raise TableError(f"{name}; python -m taic_jax.experiments.evidence --only {arguments.task} makes them")
+        remarks = {name: found[name].remarks if name in found else ["missing"] for name in PANELS}
+        draw({name: held[name] for name in PANELS if held.get(name)}, rows, remarks, arguments.out)
+    except TableError as error:
+        print(f"figure6: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
+    write_numbers(rows, FIELDS, arguments.out.with_suffix(".csv"))
+
+
+if __name__ == "__main__":
+    main()
