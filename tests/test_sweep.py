@@ -14,6 +14,7 @@ from taic_jax.checkpoint import Checkpoints
 from taic_jax.config import Config, ConfigError
 from taic_jax.config_io import load_config, to_yaml
 from taic_jax.run import main as run
+from taic_jax.sweep import runs
 from taic_jax.sweep.__main__ import main
 from taic_jax.sweep.axes import chunks, configs_of, grid, is_leaf, parse_axis, sample
 
@@ -37,6 +38,12 @@ def in_folder_with_config(tmp_path, monkeypatch):
 def table_of(folder: str) -> list[dict[str, str]]:
     with Path(folder, "table.csv").open(newline="") as file:
         return list(csv.DictReader(file))
+
+
+def killed(path: Path, **_) -> None:
+    """Stand for a `shutil.rmtree` that was killed, once it is asked for the checkpoints of a chunk."""
+    if path.name == "checkpoints" and path.parent.name.startswith("chunk"):
+        raise KilledError
 
 
 def returns_of(row: dict[str, str]) -> np.ndarray:
@@ -83,13 +90,17 @@ def test_each_point_is_the_run_that_it_would_be_alone():
 def test_an_interrupted_sweep_ends_as_if_it_had_not_been(monkeypatch, capfd):
     args = ["config.yaml", "--axes", RATE, LENGTH, *FEW]
     assert main([*args, "--run-dir", "whole"]) == 0
-    for i, count in enumerate((2, 12)):
+    for i, count in enumerate((2, None, 2)):
         with monkeypatch.context() as patch, pytest.raises(KilledError):
-            die(patch, Checkpoints, "save", count)
+            if count is None:  # in the end of the first chunk, whose checkpoints are still there
+                patch.setattr(runs.shutil, "rmtree", killed)
+            else:
+                die(patch, Checkpoints, "save", count)
             main([*args, "--run-dir", "cut", *(["--resume"] if i else [])])
     assert main([*args, "--run-dir", "cut", "--resume"]) == 0
     for name in ("table.csv", "best.yaml"):
         assert Path("cut", name).read_bytes() == Path("whole", name).read_bytes()
+    assert not list(Path("cut").glob("chunk-*/checkpoints"))
     capfd.readouterr()
     assert main([*args, "--run-dir", "cut", "--resume"]) == 0
     assert "is finished" in capfd.readouterr().err

@@ -133,8 +133,8 @@ def run_chunk(config: Config, plan: Plan, run_dir: Path, settings: dict[str, Any
         except DivergedError as error:
             print(f"taic_jax: {error}", file=sys.stderr)
             save_text(folder / "summary.json", json.dumps({"methods": {}}) + "\n")
-        for name in (EXPERIENCE, "checkpoints"):  # what is only needed to go on
-            shutil.rmtree(folder / name, ignore_errors=True)
+    for name in (EXPERIENCE, "checkpoints"):  # only needed to go on; a sweep that was killed here may have left some
+        shutil.rmtree(folder / name, ignore_errors=True)
     told = json.loads((folder / "summary.json").read_text())["methods"].get("taic", {}).get("return", {})
     nothing = [None] * (len(which) * config.seeds)
     last, first = (np.array(told.get(name, nothing), float) for name in ("per_seed", "first_per_seed"))
