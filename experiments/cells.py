@@ -10,6 +10,7 @@ from taic_jax.config_io import load_config
 ROBOTS = ("half_cheetah", "ant", "hopper", "walker2d")
 TRANSFERS = ("ant_turn", "ant_maze", "ant_push", "ant_fall")
 RECOVERY = "nav2d"
+# Interactions with the task; flat PPO of method long has twice as many, and options of kind long its experience.
 TICKS = {"ant": 2_000_000} | dict.fromkeys(TRANSFERS, 3_000_000)
 MILLION = 1_000_000
 FIRST_SEED = 200
@@ -20,10 +21,11 @@ RULES, DECODERS = ("fixed", "output", "predict"), ("open", "closed")
 # Found by `experiments.option_search`, whose log is results/option_search.csv.
 VARIABLE = {"length": 10}
 # In closed loop D follows whatever gait it saw, so the best windows of the whole run serve; in open loop they do not.
-SETTINGS: dict[str, dict[str, float]] = {
+SETTINGS: dict[str, dict[str, Any]] = {
     "open": {"since": 0.2, "until": 0.5, "lambda_kl": 0.01, "lambda_pred": 1.0, "lambda_adv": 0.1},
-    "closed": {"since": 0.0, "until": 1.0, "lambda_kl": 0.001, "lambda_pred": 0.3, "lambda_adv": 0.03},
-}
+    "closed": {"since": 0.0, "until": 1.0, "fraction": 0.2, "lambda_kl": 0.001, "lambda_pred": 0.3, "lambda_adv": 0.03,
+               "steps": 8000, "learning_rate": 1e-3},
+}  # fmt: skip
 CONSTRAINTS: dict[str, dict[str, float]] = {
     "both": {},
     "none": {"lambda_pred": 0.0, "lambda_adv": 0.0},
@@ -31,17 +33,22 @@ CONSTRAINTS: dict[str, dict[str, float]] = {
     "adv": {"lambda_pred": 0.0},
 }
 
-# Method: label and fewest seeds of figure 7. An option method's name is its termination, decoder and constraints.
+# Method: label and fewest seeds of figure 7. An option method's name is its termination, decoder and constraints, and
+# its experience, where that is not the one of `strong`.
 METHODS = {
     "strong": ("flat PPO", 20),
+    "long": ("flat PPO, twice as long", 20),
     "weak": ("flat PPO, paper-like", 10),
     "repeat": ("flat PPO, action repeat", 5),
     "fixed-open-none": ("RVAE only", 10),
     "fixed-open-both": ("Fix-len", 10),
     "output-open-both": ("Term-output", 10),
     "predict-open-both": ("Term-predict", 10),
-    "fixed-closed-both": ("Fix-len, closed loop", 20),
+    "fixed-closed-both": ("Fix-len, closed loop", 10),
+    "fixed-closed-both-long": ("Fix-len, closed loop, long experience", 20),
 }
+FLAT = {"strong": "collect", "weak": "collect", "long": "collect", "repeat": "repeat"}
+"""Methods without options, and the stage that trains each."""
 # Beside them, on HalfCheetah: every other kind of options, for the table of rules and for figure 6.
 OTHERS = {
     f"{rule}-{decoder}-{constraints}": ("", 10)
@@ -71,12 +78,12 @@ class Cell(NamedTuple):
 
 
 def flat_config(task: str, strength: str, seed: int, seeds: int) -> Config:
-    """Return the config of flat PPO: the task's preset, or weak, as the paper's silence on it suggests."""
+    """Return the config of flat PPO: the task's preset, twice as long, or weak, as the paper's silence suggests."""
     config, ticks = load_config(task), TICKS.get(task, MILLION)
     ppo = load_config("paper").collect.ppo if strength == "weak" else config.collect.ppo
     return dataclasses.replace(
         config,
-        collect=CollectConfig(ticks=ticks, capacity=MILLION, ppo=ppo),
+        collect=CollectConfig(ticks=2 * ticks if strength == "long" else ticks, capacity=MILLION, ppo=ppo),
         options=OptionsConfig(),  # what differs is told below; no preset may change it
         train=dataclasses.replace(config.train, ticks=ticks, baselines=()),
         evaluate=EvaluateConfig(episodes=20, video_ticks=0),
@@ -86,9 +93,9 @@ def flat_config(task: str, strength: str, seed: int, seeds: int) -> Config:
 
 
 def options_config(task: str, method: str, source: Path, seed: int, seeds: int) -> Config:
-    """Return the config of one kind of options, learnt from the experience of the strong flat PPO in `source`."""
-    rule, decoder, constraints = method.split("-")
-    config = flat_config(task, "strong", seed, seeds)
+    """Return the config of one kind of options, learnt from the experience of the flat PPO in `source`."""
+    rule, decoder, constraints, *long = method.split("-")
+    config = flat_config(task, long[0] if long else "strong", seed, seeds)
     changes: dict[str, Any] = {"termination": rule, "decoder": decoder} | SETTINGS[decoder] | CONSTRAINTS[constraints]
     changes |= {} if rule == "fixed" else VARIABLE
     return dataclasses.replace(
@@ -107,11 +114,11 @@ def robots(task: str, run_dir: Path, chunk: int = 10) -> list[Cell]:
         for first in range(0, minimum, chunk):
             seed, seeds = FIRST_SEED + first, min(chunk, minimum - first)
             after = f"-{seed}" if first else ""
-            if method in ("strong", "weak", "repeat"):
-                config = flat_config(task, method, seed, seeds)
-                stages = {method: "repeat" if method == "repeat" else "collect"}
+            if method in FLAT:
+                config, stages = flat_config(task, method, seed, seeds), {method: FLAT[method]}
             else:
-                config = options_config(task, method, run_dir / task / f"strong{after}", seed, seeds)
+                source = "long" if method.endswith("long") else "strong"
+                config = options_config(task, method, run_dir / task / f"{source}{after}", seed, seeds)
                 stages = {method: "train"}
             cells.append(Cell(f"{task}/{method}{after}", config, stages, "7" if method in METHODS else "6"))
     return cells

@@ -18,6 +18,7 @@ from taic_jax.statistics import iqm, stratified_interval
 GREY, BLACK, ORANGE, SKY, GREEN, BLUE, RED, PINK = (
     "#8c8c8c", "#000000", "#e69f00", "#56b4e9", "#009e73", "#0072b2", "#d55e00", "#cc79a7",
 )  # fmt: skip
+OLIVE, PURPLE = "#a89b00", "#6a1b9a"
 WARNING = "#b00020"
 RESULTS = Path("experiments/results")
 

@@ -22,8 +22,10 @@ from taic_jax.experiments.drawing import (
     BLUE,
     GREEN,
     GREY,
+    OLIVE,
     ORANGE,
     PINK,
+    PURPLE,
     RED,
     RESULTS,
     SKY,
@@ -38,12 +40,12 @@ from taic_jax.experiments.drawing import (
 from taic_jax.experiments.table import TABLE, Runs, TableError, read_table, select
 from taic_jax.statistics import bootstrap_interval, holm, iqm, probability_of_improvement
 
-COLOURS = dict(zip(METHODS, (BLACK, GREY, PINK, SKY, ORANGE, BLUE, GREEN, RED), strict=True))
+COLOURS = dict(zip(METHODS, (BLACK, OLIVE, GREY, PINK, SKY, ORANGE, BLUE, GREEN, RED, PURPLE), strict=True))
 BASELINE = "strong"
 FIELDS = (
     "task", "method", "seeds", "ticks", "pretraining", "iqm", "low", "high", "auc", "auc_low", "auc_high",
     "jump_start", "jump_starts_positive", "ticks_to_threshold", "reached", "improvement", "improvement_low",
-    "improvement_high", "p_holm", "improvement_on_weak", "remarks",
+    "improvement_high", "p_holm", "improvement_on_weak", "improvement_at_same_total", "remarks",
 )  # fmt: skip
 
 
@@ -101,6 +103,9 @@ def numbers(runs: Runs, methods: dict[str, Runs]) -> dict[str, Any]:
         row["p"] = float(stats.mannwhitneyu(last, flat.numbers["last"], alternative="greater").pvalue)
     if "weak" in methods and runs.method not in (BASELINE, "weak"):
         row["improvement_on_weak"] = probability_of_improvement(last, methods["weak"].numbers["last"])[0]
+    long = methods.get("long")
+    if long is not None and runs.pretraining and runs.pretraining + runs.ticks == long.ticks:
+        row["improvement_at_same_total"] = probability_of_improvement(last, long.numbers["last"])[0]
     return row
 
 

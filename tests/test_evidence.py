@@ -153,6 +153,8 @@ def test_runs_are_done_once_and_taken_in_as_rows(monkeypatch, tmp_path, table, c
 
 def test_figure_7_marks_what_is_missing(table, tmp_path, monkeypatch):
     rows = [made_row("ant", "strong", 0, 20, 100.0), made_row("ant", "fixed-open-both", 0, 4, 1000.0)]
+    rows[1]["pretraining"] = TICKS
+    rows.append(made_row("ant", "long", 0, 20, 2000.0, ticks=2 * TICKS))
     marked = []
     monkeypatch.setattr(figure7, "mark", lambda axes, title, remarks: marked.append((title, *remarks)))
     out = tmp_path / "figure7.png"
@@ -160,9 +162,11 @@ def test_figure_7_marks_what_is_missing(table, tmp_path, monkeypatch):
     assert out.stat().st_size > 10_000
     (ant, hopper) = marked
     assert ant[:2] == ("ant", "Fix-len: 4 of 10 seeds") and "missing: flat PPO, paper-like," in ant[2]
-    assert "missing: flat PPO, flat PPO, paper-like" in hopper[1]
+    assert "missing: flat PPO, flat PPO, twice as long, flat PPO, paper-like" in hopper[1]
     numbers = out.with_suffix(".csv").read_text().splitlines()
-    assert "1,1,1" in numbers[2], "every seed of the one beats every seed of the other"
+    options = next(line for line in numbers if ",fixed-open-both," in line)
+    assert "1,1,1" in options, "every seed of the one beats every seed of the other"
+    assert options.endswith(",0,4 of 10 seeds"), "but none does at the same total"
 
 
 def test_figures_refuse_an_empty_table(table, capsys):
