@@ -59,6 +59,8 @@ def draw(example: dict[str, Any], rows: list[dict[str, Any]], remarks: Sequence[
     left = figure.add_subplot(grid[:, 0])
     draw_paths(left, paths, between, np.arange(len(paths)))
     left.set_ylabel("y in m")
+    left.plot([], [], "--", color=RED, label="windows of the experience")
+    left.legend(loc="upper left")
     mark(left, "a) between two options", remarks)
     for d in range(size):
         axes = figure.add_subplot(grid[d // ((size + 1) // 2), 2 + d % ((size + 1) // 2)])
