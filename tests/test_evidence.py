@@ -10,7 +10,7 @@ import pytest
 from tiny_runs import CONFIG, PPO, tiny_steps, with_fields
 
 from taic_jax.config import Config
-from taic_jax.experiments import drawing, evidence, figure5c, figure6, figure7, figure8
+from taic_jax.experiments import drawing, evidence, figure5c, figure6, figure7, figure8, spaces
 from taic_jax.experiments.cells import Cell, all_cells
 from taic_jax.experiments.recovery import AFTER, recovery_of
 from taic_jax.experiments.table import TableError, append_row, config_hash, difference, read_table, row_of, select
@@ -147,6 +147,10 @@ def test_runs_are_done_once_and_taken_in_as_rows(monkeypatch, tmp_path, table, c
     evidence.main(arguments)
     evidence.main([*arguments, "--list"])
     assert capsys.readouterr().out.count("in the table") == 2
+    example = spaces.example_space(tmp_path / "options")
+    assert np.shape(example["options"]) == (spaces.SHOWN, options.options.size)
+    ends = np.array(example["ends"])
+    assert np.isfinite(ends).all() and (ends.std(axis=0) > 0).all(), "options lead from one state to several"
     evidence_row = row_of(tmp_path / "flat", tmp_path, "strong", "collect")
     assert evidence_row["config"] == strong["config"]
 
