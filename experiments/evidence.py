@@ -22,7 +22,7 @@ from taic_jax.checkpoint import ArtifactError
 from taic_jax.compilation import keep_programs
 from taic_jax.config import ConfigError, Shard
 from taic_jax.devices import Devices, make_devices, open_devices
-from taic_jax.experiments.cells import PATHS, Cell, all_cells
+from taic_jax.experiments.cells import PATHS, SPACES, Cell, all_cells
 from taic_jax.experiments.option_paths import paths_of
 from taic_jax.experiments.spaces import example_space, measure_spaces
 from taic_jax.experiments.table import TABLE, TableError, append_row, read_table, row_of
@@ -100,7 +100,7 @@ def make_row(cell: Cell, run_dir: Path, method: str, stage: str) -> dict[str, An
     row = row_of(run_dir / cell.name, run_dir, method, stage)
     if cell.figure in ("6", "7") and stage == "train":
         row["numbers"] |= measure_spaces(run_dir / cell.name)
-        row |= {"example": example_space(run_dir / cell.name)}
+        row |= {"example": example_space(run_dir / cell.name)} if method in SPACES else {}
     return row
 
 

@@ -19,10 +19,9 @@ from matplotlib.axes import Axes
 
 from taic_jax.experiments.cells import PATHS, RECOVERY
 from taic_jax.experiments.drawing import BLUE, GREY, RED, RESULTS, mark, plt, save, styled
-from taic_jax.experiments.figure7 import write_numbers
+from taic_jax.experiments.figure7 import with_interval, write_numbers
 from taic_jax.experiments.option_paths import SWEEP
 from taic_jax.experiments.table import TABLE, TableError, read_table, select
-from taic_jax.statistics import bootstrap_interval, iqm
 
 MODELS = 10
 FIELDS = ("measure", "models", "iqm", "low", "high", "remarks")
@@ -94,8 +93,9 @@ def main(args: Sequence[str] | None = None) -> None:
     example = next(row["example"] for row in table if (row["task"], row["method"]) == (RECOVERY, PATHS))
     rows = []
     for name, values in runs.numbers.items():
-        told = dict(zip(("iqm", "low", "high"), (float(iqm(values)), *bootstrap_interval(values)), strict=True))
-        rows.append({"measure": name, "models": len(values), **told, "remarks": "; ".join(runs.remarks)})
+        rows.append(
+            {"measure": name, "models": len(values), **with_interval(values), "remarks": "; ".join(runs.remarks)}
+        )
     draw(example, rows, runs.remarks, arguments.out)
     write_numbers(rows, FIELDS, arguments.out.with_suffix(".csv"))
 

@@ -18,14 +18,12 @@ import tyro
 from jaxtyping import Float
 from matplotlib.axes import Axes
 
-from taic_jax.experiments.cells import METHODS, OTHERS
+from taic_jax.experiments.cells import METHODS, OTHERS, SPACES
 from taic_jax.experiments.drawing import BLUE, GREY, RESULTS, mark, plt, save, styled
-from taic_jax.experiments.figure7 import write_numbers
+from taic_jax.experiments.figure7 import with_interval, write_numbers
 from taic_jax.experiments.spaces import PREFIX
 from taic_jax.experiments.table import TABLE, Runs, TableError, read_table, select
-from taic_jax.statistics import bootstrap_interval, iqm
 
-PANELS = {"fixed-open-none": "RVAE", "output-open-both": "Term-output", "predict-open-both": "Term-predict"}
 PERPLEXITIES = (10, 30, 90)
 MODELS = 10
 MEASURES = {
@@ -76,8 +74,7 @@ def numbers(runs: Runs) -> list[dict[str, Any]]:
     for name, values in runs.numbers.items():
         if name.startswith(PREFIX):
             row = {"task": runs.task, "method": runs.method, "models": len(values), "measure": name[len(PREFIX) :]}
-            row |= dict(zip(("iqm", "low", "high"), (float(iqm(values)), *bootstrap_interval(values)), strict=True))
-            rows.append(row | {"remarks": "; ".join(runs.remarks)})
+            rows.append(row | with_interval(values) | {"remarks": "; ".join(runs.remarks)})
     return rows
 
 
@@ -98,10 +95,10 @@ def draw(
 ) -> None:
     """Draw a column of t-SNE for each of the paper's panels, a row for each perplexity, and the measures beside."""
     figure, panels = plt.subplots(
-        len(PERPLEXITIES), len(PANELS) + 1, figsize=(13.5, 9.6), width_ratios=[1.0] * len(PANELS) + [1.2]
+        len(PERPLEXITIES), len(SPACES) + 1, figsize=(13.5, 9.6), width_ratios=[1.0] * len(SPACES) + [1.2]
     )
     for line, perplexity in zip(panels, PERPLEXITIES, strict=True):
-        for axes, (method, label) in zip(line[:-1], PANELS.items(), strict=True):
+        for axes, (method, label) in zip(line[:-1], SPACES.items(), strict=True):
             axes.set_xticks([])
             axes.set_yticks([])
             if method in examples:
@@ -127,8 +124,8 @@ def main(args: Sequence[str] | None = None) -> None:
         if not rows:
             name = f"{arguments.table}: no row of figure 6"
             raise TableError(f"{name}; python -m taic_jax.experiments.evidence --only {arguments.task} makes them")
-        remarks = {name: found[name].remarks if name in found else ["missing"] for name in PANELS}
-        draw({name: held[name] for name in PANELS if held.get(name)}, rows, remarks, arguments.out)
+        remarks = {name: found[name].remarks if name in found else ["missing"] for name in SPACES}
+        draw({name: held[name] for name in SPACES if held.get(name)}, rows, remarks, arguments.out)
     except TableError as error:
         print(f"figure6: {error}", file=sys.stderr)
         raise SystemExit(2) from None

@@ -77,14 +77,18 @@ def read_methods(
     return found, remarks
 
 
+def with_interval(values: np.ndarray, names: Sequence[str] = ("iqm", "low", "high")) -> dict[str, float]:
+    """Return the interquartile mean of one number per seed, and its 95 % interval."""
+    return dict(zip(names, (float(iqm(values)), *bootstrap_interval(values)), strict=True))
+
+
 def numbers(runs: Runs, methods: dict[str, Runs]) -> dict[str, Any]:
     """Return what the table of the figure says of one method, beside flat PPO on the same task."""
     last, curve = runs.numbers["last"], runs.curves["return"]
     area = np.nanmean(curve, axis=1)
     row = {"task": runs.task, "method": runs.method, "seeds": len(last), "ticks": runs.ticks}
     row |= {"pretraining": runs.pretraining, "remarks": "; ".join(runs.remarks)}
-    row |= dict(zip(("iqm", "low", "high"), (iqm(last), *bootstrap_interval(last)), strict=True))
-    row |= dict(zip(("auc", "auc_low", "auc_high"), (iqm(area), *bootstrap_interval(area)), strict=True))
+    row |= with_interval(last) | with_interval(area, ("auc", "auc_low", "auc_high"))
     if BASELINE not in methods:
         return row
     flat = methods[BASELINE]

@@ -30,9 +30,9 @@ from taic_jax.experiments.drawing import (
     save,
     styled,
 )
-from taic_jax.experiments.figure7 import adjust, read_methods, write_numbers
+from taic_jax.experiments.figure7 import adjust, read_methods, with_interval, write_numbers
 from taic_jax.experiments.table import TABLE, Runs, TableError, read_table
-from taic_jax.statistics import bootstrap_interval, iqm, probability_of_improvement
+from taic_jax.statistics import probability_of_improvement
 
 SEEDS = 10
 COLOURS = {"options": RED, "flat": BLACK, "transfer": BLUE}
@@ -60,7 +60,7 @@ def numbers(runs: Runs, methods: dict[str, Runs]) -> dict[str, Any]:
     """Return what the table of the figure says of one method; for options the worse of both comparisons."""
     last = runs.numbers["last"]
     row: dict[str, Any] = {"task": runs.task, "method": runs.method, "seeds": len(last), "ticks": runs.ticks}
-    row |= dict(zip(("iqm", "low", "high"), (iqm(last), *bootstrap_interval(last)), strict=True))
+    row |= with_interval(last)
     row |= {ours: float(np.mean(runs.numbers[name])) for name, ours in MEASURES.items() if name in runs.numbers}
     if "final/success" in runs.numbers:
         success = runs.numbers["final/success"]
