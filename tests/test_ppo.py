@@ -51,6 +51,21 @@ def test_loss_by_hand():
     np.testing.assert_allclose(loss, policy_loss + 0.5 * value_loss - 0.1 * entropy, rtol=1e-5)
 
 
+@pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
+@pytest.mark.parametrize("count", [1, 2, 96, 128])
+def test_the_chosen_rows_come_first_and_each_anywhere_among_them(count, share):
+    chosen = np.arange(count) % 10 < 10 * share
+    keys = jax.random.split(jax.random.key(0), 2000)
+    orders = np.asarray(jax.jit(jax.vmap(partial(update.shuffled, jnp.asarray(chosen))))(keys)).astype(int)
+    np.testing.assert_array_equal(np.sort(orders, axis=1), np.broadcast_to(np.arange(count), orders.shape))
+    first = chosen.sum()
+    assert chosen[orders[:, :first]].all()
+    if first > 1:  # the chosen row 0 comes at each of the first places, and each chosen row comes first, equally often
+        for found in (np.argmax(orders == 0, axis=1), orders[:, 0]):
+            counts = np.unique(found, return_counts=True)[1]
+            assert len(counts) == first and stats.chisquare(counts).pvalue > 1e-4
+
+
 def test_options_are_drawn_from_the_policy():
     policy, rng = Policy(2, (3,)), np.random.default_rng(0)
     shapes = jax.eval_shape(lambda: policy.init(jax.random.key(0), 1, jnp.zeros(())))

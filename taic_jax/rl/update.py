@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import optax
 from flax import struct
-from jaxtyping import Array, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
 from taic_jax.config import PPOConfig
 from taic_jax.networks import Policy, PolicyParams
@@ -83,6 +83,19 @@ def _minibatch(
     return Update(params, optimizer, carry.terms + terms)
 
 
+def shuffled(chosen: Bool[Array, " R"], key: Key[Array, ""]) -> UInt32[Array, " R"]:
+    """Return the rows' indices: the chosen ones first, in random order.
+
+    Index and random bits are sorted as one integer, which XLA does four times as fast as it sorts pairs. Rows whose
+    bits are equal keep their order, which tells only where they lie at an edge between minibatches.
+    """
+    width = max(1, (len(chosen) - 1).bit_length())
+    index = jnp.arange(len(chosen), dtype=jnp.uint32)
+    above = jax.random.bits(key, chosen.shape, jnp.uint32) >> (width + 1) << width
+    last = (~chosen).astype(jnp.uint32) << 31
+    return jnp.sort(last | above | index) & jnp.uint32(2**width - 1)
+
+
 def _epoch(
     policy: Policy,
     config: PPOConfig,
@@ -95,9 +108,8 @@ def _epoch(
     """Pass once over all decisions in random order, in as many minibatches as they fill."""
     count = jnp.sum(decision, dtype=jnp.int32)
     num_minibatches = (count + config.minibatch_size - 1) // config.minibatch_size
-    # Decisions first, in random order; the ticks between them are never touched.
-    order = jnp.argsort(jnp.where(decision, jax.random.uniform(key, decision.shape), 2.0))
-    rows = jnp.pad(packed[order], ((0, config.minibatch_size), (0, 0)))
+    # The ticks between decisions are never touched.
+    rows = jnp.pad(packed[shuffled(decision, key)], ((0, config.minibatch_size), (0, 0)))
     size = policy.option_size
     split = Decisions(rows[:, size + 3 :], rows[:, :size], *jnp.moveaxis(rows[:, size : size + 3], 1, 0))
     step = partial(_minibatch, policy, config, learning_rate, split, count, num_minibatches)
