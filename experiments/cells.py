@@ -4,13 +4,13 @@ import dataclasses
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from taic_jax.config import CollectConfig, Config, EvaluateConfig, OptionsConfig
+from taic_jax.config import CollectConfig, Config, EvaluateConfig, FineTuneConfig, OptionsConfig
 from taic_jax.config_io import load_config
 
 ROBOTS = ("half_cheetah", "ant", "hopper", "walker2d")
 TRANSFERS = ("ant_turn", "ant_maze", "ant_push", "ant_fall")
 RECOVERY = "nav2d"
-# Interactions with the task; flat PPO of method long has twice as many, and options of kind long its experience.
+# Interactions with the task; flat PPO of method long has twice as many.
 TICKS = {"ant": 2_000_000} | dict.fromkeys(TRANSFERS, 3_000_000)
 MILLION = 1_000_000
 FIRST_SEED = 200
@@ -35,10 +35,10 @@ CONSTRAINTS: dict[str, dict[str, float]] = {
 }
 
 # Method: label and fewest seeds of figure 7. An option method's name is its termination, decoder and constraints, and
-# its experience, where that is not the one of `strong`.
+# `tuned` where PPO changes D too.
 METHODS = {
     "strong": ("flat PPO", 20),
-    "long": ("flat PPO, twice as long", 20),
+    "long": ("flat PPO, twice as long", 10),
     "weak": ("flat PPO, paper-like", 10),
     "repeat": ("flat PPO, action repeat", 5),
     "fixed-open-none": ("RVAE only", 10),
@@ -46,7 +46,7 @@ METHODS = {
     "output-open-both": ("Term-output", 10),
     "predict-open-both": ("Term-predict", 10),
     "fixed-closed-both": ("Fix-len, closed loop", 10),
-    "fixed-closed-both-long": ("Fix-len, closed loop, long experience", 20),
+    "fixed-closed-both-tuned": ("Fix-len, closed loop, fine-tuned", 20),
 }
 # Of these figure 6 draws an example: the method's name in the paper.
 SPACES = {"fixed-open-none": "RVAE", "output-open-both": "Term-output", "predict-open-both": "Term-predict"}
@@ -101,14 +101,16 @@ def name_of(task: str, method: str, seed: int) -> str:
 
 
 def options_config(task: str, method: str, run_dir: Path, seed: int, seeds: int) -> Config:
-    """Return the config of one kind of options, learnt from the experience of flat PPO's run with these seeds."""
-    rule, decoder, constraints, strength = (*method.split("-"), "strong")[:4]
-    config = flat_config(task, strength, seed, seeds)
-    source = run_dir / name_of(task, strength, seed)
+    """Return the config of one kind of options, learnt from what `strong` met with these seeds."""
+    rule, decoder, constraints, *tuned = method.split("-")
+    config = flat_config(task, "strong", seed, seeds)
+    source = run_dir / name_of(task, "strong", seed)
     changes: dict[str, Any] = {"termination": rule, "decoder": decoder} | SETTINGS[decoder] | CONSTRAINTS[constraints]
     changes |= {} if rule == "fixed" else VARIABLE
     return dataclasses.replace(
-        config, options=dataclasses.replace(config.options, experience=(str(source),), **changes)
+        config,
+        options=dataclasses.replace(config.options, experience=(str(source),), **changes),
+        train=dataclasses.replace(config.train, fine_tune=FineTuneConfig(epochs=10) if tuned else FineTuneConfig()),
     )
 
 

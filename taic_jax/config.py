@@ -156,15 +156,17 @@ class OptionsConfig:
 
 @dataclass(frozen=True)
 class FineTuneConfig:
-    """Fine-tuning of D by PPO on its actions, in turns with the policy over options; off unless every is set."""
+    """Fine-tuning of D by PPO on its actions, in turns with the policy over options; off unless epochs is set."""
 
-    every: int = 0
-    """Iterations of the policy between two of D; 0 leaves D as it was learnt."""
-    learning_rate: float = 1e-4
-    """Step size of Adam for D."""
-    std: float = 0.1
-    """Standard deviation of the noise on D's actions in its own iterations."""
-    kl_weight: float = 1.0
+    epochs: int = 0
+    """Passes over the ticks of each iteration that update D; 0 leaves D as it was learnt."""
+    minibatch_size: int = 512
+    """Ticks per gradient step of D."""
+    learning_rate: float = 5e-4
+    """Step size of Adam for D; it decays as that of the policy does."""
+    std: float = 0.2
+    """Standard deviation of the noise on D's actions while training."""
+    kl_weight: float = 0.0
     """Weight of the divergence from the D that was learnt."""
 
 

@@ -13,7 +13,6 @@ from taic_jax.config import FineTuneConfig, PPOConfig
 from taic_jax.envs.base import Env
 from taic_jax.evaluate import evaluate
 from taic_jax.experience import as_experience
-from taic_jax.guard import earliest
 from taic_jax.options.dataset import Experience
 from taic_jax.options.execution import Executor
 from taic_jax.options.model import OptionModel
@@ -68,31 +67,22 @@ class Level:
 
 @dataclass(frozen=True)
 class FineTunedLevel(Level):
-    """A policy over options whose D is fine-tuned: a step is `every` iterations of the policy, then one of D."""
+    """A policy over options whose D is fine-tuned on the same ticks."""
 
     fine_tune: FineTuneConfig
-
-    @property
-    def unit(self) -> int:
-        """Ticks of one step."""
-        return super().unit * (self.fine_tune.every + 1)
 
     def init(self, key: Array, *model: OptionModel) -> tuple[ppo.TrainState, Tuned]:
         """Return the state of an untrained policy, and the learnt D."""
         executor: Any = self.executor_of(*model)
-        return super().init(key, *model), fine_tune.init(self.fine_tune, self.config, executor)
+        return super().init(key, *model), fine_tune.init(self.config, executor)
 
     def step(self, state: Any, *model: OptionModel) -> tuple[Any, dict, None]:
-        """Run the policy's iterations and D's; return the metrics of both."""
+        """Run one iteration of the policy and of D; return the metrics of both."""
         learnt: Any = self.executor_of(*model)
-        policy, tuned = state
-        executor = fine_tune.tuned_executor(learnt, tuned.decoder)
-        count = self.num_steps * self.fine_tune.every
-        one = partial(ppo.iterate, self.config, self.env, executor, count)
-        policy, metrics = jax.lax.scan(lambda s, _: one(s)[:2], policy, None, self.fine_tune.every)
-        policy, tuned, told = fine_tune.iterate(self.config, self.fine_tune, self.env, learnt, policy, tuned)
-        nonfinite = earliest(jnp.append(metrics["nonfinite"], told["nonfinite"]))
-        return (policy, tuned), jax.tree.map(lambda x: x[-1], metrics) | told | {"nonfinite": nonfinite}, None
+        policy, tuned, metrics = fine_tune.iterate(
+            self.config, self.fine_tune, self.env, learnt, self.num_steps, *state
+        )
+        return (policy, tuned), metrics, None
 
     def agent(self, state: Any, *model: OptionModel) -> ppo.Agent:
         """Return what acts: the policy over the fine-tuned options."""

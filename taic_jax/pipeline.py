@@ -213,7 +213,7 @@ def make_level(config: Config, env: Env, stage: str) -> Level:
     if stage == "train":
         executor_of = partial(make_executor, config.options, env.action_size)
         level = Level(env, config.train.ppo, config.train.ticks, episodes, executor_of)
-        return FineTunedLevel(**vars(level), fine_tune=tune) if tune.every else level
+        return FineTunedLevel(**vars(level), fine_tune=tune) if tune.epochs else level
     ticks = {"collect": config.collect.ticks, "total": config.collect.ticks + config.train.ticks}
     executor = IdentityExecutor(env.action_size, config.options.length if stage == "repeat" else 1)
     return Level(env, config.collect.ppo, ticks.get(stage, config.train.ticks), episodes, lambda: executor)
@@ -289,7 +289,7 @@ def train_over_options(run: Run, env: Env, model: OptionModel) -> Trained:
     """Train the policy that acts by choosing options; a fine-tuned D is saved as the artifact `options_fine_tuned`."""
     config = run.config
     trained = _train(run, env, "train", model)
-    if config.train.fine_tune.every:
+    if config.train.fine_tune.epochs:
         executor: Any = trained.agent.executor
         save_options(run.dir / "options_fine_tuned", executor.model, env, config.options)
     return trained

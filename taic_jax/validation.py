@@ -5,7 +5,7 @@ from typing import Any
 
 from taic_jax.config import CollectConfig, Config, ConfigError, OptionsConfig, TrainConfig, walk
 
-# Closed intervals by field name. Other integers are at least 1, other floats at least 0.
+# Closed intervals by a field's name, or its dotted name. Other integers are at least 1, other floats at least 0.
 TINY = 1e-6
 BOUNDS: dict[str, tuple[float, float]] = {
     "since": (0, 1),
@@ -17,7 +17,7 @@ BOUNDS: dict[str, tuple[float, float]] = {
     "video_ticks": (0, math.inf),
     "clip": (TINY, math.inf),
     "delta": (TINY, math.inf),
-    "every": (0, math.inf),
+    "train.fine_tune.epochs": (0, math.inf),
     "std": (TINY, math.inf),
     "fraction": (TINY, 1),
     "gamma": (0, 1),
@@ -78,7 +78,8 @@ def _check_bounds(name: str, value: Any) -> None:
     for number in value if isinstance(value, tuple) else (value,):
         if isinstance(number, bool) or not isinstance(number, int | float):
             continue
-        low, high = BOUNDS.get(name.rpartition(".")[2], (1 if isinstance(number, int) else 0, math.inf))
+        bounds = BOUNDS.get(name.rpartition(".")[2], (1 if isinstance(number, int) else 0, math.inf))
+        low, high = BOUNDS.get(name, bounds)
         if not (low <= number <= high and math.isfinite(number)):
             expected = f"at least {low}" if high == math.inf else f"in [{low}, {high}]"
             nearest = low if math.isnan(number) or number < low else high
@@ -87,13 +88,14 @@ def _check_bounds(name: str, value: Any) -> None:
 
 def _check_sizes(stage: str, config: CollectConfig | TrainConfig) -> None:
     ppo, ticks = config.ppo, config.ppo.num_envs * config.ppo.rollout_length
-    every = config.fine_tune.every if isinstance(config, TrainConfig) else 0
     iteration = f"{stage}.ppo.num_envs * {stage}.ppo.rollout_length = {ticks}"
     if ppo.minibatch_size > ticks:
         raise _impossible(f"{stage}.ppo.minibatch_size", ppo.minibatch_size, f"at most {iteration}", ticks)
-    if config.ticks < ticks * (every + 1):
-        step = f"{every + 1} iterations of {iteration}" if every else f"one iteration, {iteration}"
-        raise _impossible(f"{stage}.ticks", config.ticks, f"at least {step}", ticks * (every + 1))
+    fine = config.fine_tune if isinstance(config, TrainConfig) else None
+    if fine and fine.epochs and fine.minibatch_size > ticks:
+        raise _impossible(f"{stage}.fine_tune.minibatch_size", fine.minibatch_size, f"at most {iteration}", ticks)
+    if config.ticks < ticks:
+        raise _impossible(f"{stage}.ticks", config.ticks, f"at least one iteration, {iteration}", ticks)
 
 
 def _impossible(name: str, value: Any, expected: str, nearest: int | float) -> ConfigError:

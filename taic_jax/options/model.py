@@ -7,7 +7,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Float, Int, Key
 
 from taic_jax.config import OptionsConfig
 from taic_jax.networks import MLP
@@ -84,6 +84,12 @@ class OpenDecoder(nn.Module):
         outputs = self.head(self.rnn(inputs, initial_carry=self.start(option)))
         return outputs[:, :-1], outputs[:, -1]
 
+    def at(
+        self, option: Float[Array, " D"], state: Float[Array, " P"], tick: Int[Array, ""], length: int
+    ) -> Float[Array, " A"]:
+        """Return the `tick`-th action of `length`, counted from 0; whatever the state."""
+        return self(option, jnp.broadcast_to(state, (length, *state.shape)))[0][tick]
+
 
 class ClosedDecoder(nn.Module):
     """D in closed loop: pi(a|o, s) and the end logit, from the normalised state of each tick (§4.2.2, §5).
@@ -116,6 +122,12 @@ class ClosedDecoder(nn.Module):
         ticks = jnp.arange(len(states), dtype=jnp.float32)[:, None] / self.length
         outputs = self.mlp(jnp.hstack([states, jnp.broadcast_to(option, (len(states), *option.shape)), ticks]))
         return outputs[:, :-1], outputs[:, -1]
+
+    def at(
+        self, option: Float[Array, " D"], state: Float[Array, " P"], tick: Int[Array, ""], length: int
+    ) -> Float[Array, " A"]:
+        """Return the `tick`-th action of `length`, counted from 0, in this state."""
+        return self.step(tick.astype(jnp.float32) / length, option, state)[1][0]
 
 
 class Predictor(nn.Module):

@@ -1,7 +1,8 @@
 """Fine-tuning D: PPO on primitive actions through the decoder, in turns with the policy over options (§5).
 
-In D's own iterations its actions are drawn around its output, so that they have a likelihood that PPO's gradient can
-reach D by; policy, critic, E, P and F stay as they are. A KL term holds D near the one that was learnt.
+D's actions are drawn around its output, so that they have a likelihood that PPO's gradient can reach D by. From the
+same ticks first the policy learns which option to choose, then D what to do in it; E, P and F stay as they are. A KL
+term may hold D near the one that was learnt.
 """
 
 from functools import partial
@@ -16,13 +17,13 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from taic_jax import normalize
 from taic_jax.config import FineTuneConfig, PPOConfig
 from taic_jax.envs.base import Env
-from taic_jax.envs.wrappers import AutoReset
-from taic_jax.guard import first_nonfinite
+from taic_jax.guard import earliest, first_nonfinite
 from taic_jax.networks import apply
 from taic_jax.options.execution import Decoding, OptionExecutor
 from taic_jax.returns import semi_markov_advantages
 from taic_jax.rl import ppo
-from taic_jax.rl.rollout import Rollout, rollout
+from taic_jax.rl.rollout import Rollout
+from taic_jax.rl.update import shuffled
 from taic_jax.types import Scalar
 
 
@@ -78,16 +79,15 @@ class Actions(struct.PyTreeNode):
     advantage: Array
 
 
-def make_optimizer(config: FineTuneConfig, max_grad_norm: Scalar) -> optax.GradientTransformation:
-    """Return Adam behind global-norm clipping for D's parameters."""
-    clip = optax.clip_by_global_norm(max_grad_norm)
-    return optax.flatten(optax.chain(clip, optax.scale_by_adam(eps=1e-5), optax.scale(-config.learning_rate)))
+def make_optimizer(config: PPOConfig) -> optax.GradientTransformation:
+    """Return Adam behind global-norm clipping for D's parameters; the step size is applied by `_epoch`."""
+    return optax.flatten(optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.scale_by_adam(eps=1e-5)))
 
 
-def init(config: FineTuneConfig, ppo_config: PPOConfig, executor: OptionExecutor) -> Tuned:
+def init(config: PPOConfig, executor: OptionExecutor) -> Tuned:
     """Return the learnt D, and an optimiser that has done nothing yet."""
     decoder = executor.model.params["decoder"]
-    return Tuned(decoder, make_optimizer(config, ppo_config.max_grad_norm).init(decoder))
+    return Tuned(decoder, make_optimizer(config).init(decoder))
 
 
 def tuned_executor(executor: OptionExecutor, decoder: Any) -> OptionExecutor:
@@ -110,14 +110,8 @@ def fill_options(option: Float[Array, "T B D"], decision: Bool[Array, "T B"], fi
 def mean_action(
     executor: OptionExecutor, decoder: Any, option: Float[Array, " D"], state: Float[Array, " P"], tick: Int[Array, ""]
 ) -> Float[Array, " A"]:
-    """Return D's output at the option's `tick`-th action, counted from 0, in this normalised state.
-
-    In open loop D runs from the option's start and never sees the state, in closed loop it needs nothing else; so
-    one unrolled call with the same state at every tick serves both.
-    """
-    states = jnp.broadcast_to(state, (executor.length, *state.shape))
-    actions, _ = apply(executor.networks.decoder, decoder, option, states)
-    return actions[tick]
+    """Return D's output at the option's `tick`-th action, counted from 0, in this normalised state."""
+    return apply(executor.networks.decoder, decoder, option, state, tick, executor.length, method="at")
 
 
 def decoder_loss(
@@ -143,27 +137,36 @@ def iterate(
     fine: FineTuneConfig,
     env: Env,
     executor: OptionExecutor,
+    num_iterations: int,
     state: ppo.TrainState,
     tuned: Tuned,
 ) -> tuple[ppo.TrainState, Tuned, dict[str, Array]]:
-    """Run one iteration of D: T ticks of B environments, then all epochs of updates of D alone.
+    """Run one iteration: one of PPO over options with noise on D's actions, then D's epochs on the same ticks.
 
-    Returns the state with its environments moved on, D, and the iteration's metrics.
+    Args:
+      config: of PPO; its `clip`, `gamma`, `lambda_` and `max_grad_norm` are D's too.
+      fine: the rest of D's.
+      env: the task.
+      executor: of the options that were learnt.
+      num_iterations: over which the step sizes decay.
+      state: of the policy.
+      tuned: D so far.
+
+    Returns the next state, D, and the metrics of both.
     """
-    key, key_rollout, key_update = jax.random.split(state.key, 3)
     noisy = NoisyExecutor(tuned_executor(executor, tuned.decoder), fine.std)
-    decide = ppo.as_agent(config, executor, state).decide()
-    first = state.running.option.option
-    running, ticks = rollout(AutoReset(env), noisy, decide, state.running, key_rollout, config.rollout_length)
-    rows = _rows(config, fine, noisy, state, ticks, first, running.env.obs, key_rollout)
-    learnt = executor.model.params["decoder"]
-    step = partial(_epoch, config, fine, executor, learnt, rows)
-    tuned, losses = jax.lax.scan(step, tuned, jax.random.split(key_update, config.epochs))
-    nonfinite = first_nonfinite(
-        action=ticks.action, observation=(ticks.obs, ticks.final_obs), reward=ticks.reward, loss=losses, gradient=tuned
-    )
-    metrics = {"decoder_loss": jnp.mean(losses[0]), "decoder_kl": losses[1][-1, -1], "nonfinite": nonfinite}
-    return state.replace(running=running, key=key), tuned, metrics
+    after, metrics, ticks = ppo.iterate(config, env, noisy, num_iterations, state)
+    rows = _rows(config, fine, noisy, state, ticks, after.running.env.obs)
+    learning_rate = ppo.step_size(config, fine.learning_rate, state.iteration, num_iterations)
+    step = partial(_epoch, config, fine, learning_rate, executor, executor.model.params["decoder"], rows)
+    key, key_update = jax.random.split(after.key)
+    tuned, losses = jax.lax.scan(step, tuned, jax.random.split(key_update, fine.epochs))
+    metrics |= {
+        "decoder_loss": jnp.mean(losses[0]),
+        "decoder_kl": losses[1][-1, -1],
+        "nonfinite": earliest(jnp.stack([metrics["nonfinite"], first_nonfinite(loss=losses, gradient=tuned)])),
+    }
+    return after.replace(key=key), tuned, metrics
 
 
 def _rows(
@@ -172,11 +175,9 @@ def _rows(
     noisy: NoisyExecutor,
     state: ppo.TrainState,
     ticks: Rollout,
-    first: Float[Array, "B D"],
     last_obs: Float[Array, "B S"],
-    key: Key[Array, ""],
 ) -> Actions:
-    """Return every tick as a row, with the advantage of its action over what the critic expected there."""
+    """Return every tick after `state` as a row, with the advantage of its action over what the critic expected."""
     policy, model = ppo.make_policy(noisy, config), noisy.inner.model
     done = ticks.terminated | ticks.truncated
     _, reward = normalize.scale_rewards(state.reward_scale, ticks.reward, done, config.gamma)
@@ -195,13 +196,13 @@ def _rows(
         gamma=config.gamma,
         lambda_=config.lambda_,
     )
-    option = fill_options(ticks.option, ticks.decision, first)
+    option = fill_options(ticks.option, ticks.decision, state.running.option.option)
     proprioception = model.state_scale(ticks.obs[..., : model.state_scale.mean.shape[-1]])
     means = jax.vmap(jax.vmap(partial(mean_action, noisy.inner, model.params["decoder"])))(
         option, proprioception, ticks.duration - 1
     )
-    # The same numbers that the rollout drew from this key.
-    noise = jax.random.normal(key, (*ticks.reward.shape, noisy.option_size + noisy.noise_size))
+    # The same numbers that the rollout drew.
+    noise = jax.random.normal(ppo.rollout_key(state), (*ticks.reward.shape, noisy.option_size + noisy.noise_size))
     action = means + fine.std * noise[..., -means.shape[-1] :]
     log_prob = jax.vmap(partial(_log_prob, std=fine.std))(action, means)
     advantage = (advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-8)
@@ -212,6 +213,7 @@ def _rows(
 def _epoch(
     config: PPOConfig,
     fine: FineTuneConfig,
+    learning_rate: Scalar,
     executor: OptionExecutor,
     learnt: Any,
     rows: Actions,
@@ -219,14 +221,15 @@ def _epoch(
     key: Key[Array, ""],
 ) -> tuple[Tuned, tuple[Array, Array]]:
     """Pass once over all ticks in random order; a rest that fills no minibatch waits for the next pass."""
-    count = len(rows.advantage) // config.minibatch_size
-    order = jax.random.permutation(key, len(rows.advantage))[: count * config.minibatch_size]
-    batches = jax.tree.map(lambda x: x[order].reshape((count, config.minibatch_size, *x.shape[1:])), rows)
+    count = len(rows.advantage) // fine.minibatch_size
+    order = shuffled(jnp.ones(len(rows.advantage), bool), key)[: count * fine.minibatch_size]
+    batches = jax.tree.map(lambda x: x[order].reshape((count, fine.minibatch_size, *x.shape[1:])), rows)
 
     def minibatch(tuned: Tuned, batch: Actions) -> tuple[Tuned, tuple[Array, Array]]:
         gradient, terms = jax.grad(decoder_loss, has_aux=True)(tuned.decoder, learnt, executor, batch, config, fine)
         with jax.numpy_dtype_promotion("standard"):  # Optax raises a float to an integer power
-            updates, optimizer = make_optimizer(fine, config.max_grad_norm).update(gradient, tuned.optimizer)
-        return Tuned(optax.apply_updates(tuned.decoder, updates), optimizer), terms
+            updates, optimizer = make_optimizer(config).update(gradient, tuned.optimizer)
+        decoder = jax.tree.map(lambda p, u: p - learning_rate * u, tuned.decoder, updates)
+        return Tuned(decoder, optimizer), terms
 
     return jax.lax.scan(minibatch, tuned, batches)

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import optax
 from flax import struct
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Float, Int, Key
 
 from taic_jax import normalize
 from taic_jax.config import PPOConfig
@@ -87,6 +87,17 @@ def as_agent(config: PPOConfig, executor: Executor, state: TrainState) -> Agent:
     return Agent(executor, state.params, state.obs_statistics, make_policy(executor, config))
 
 
+def rollout_key(state: TrainState) -> Key[Array, ""]:
+    """Return the key that the next iteration's rollout draws its noise from."""
+    return jax.random.split(state.key, 3)[1]
+
+
+def step_size(config: PPOConfig, learning_rate: Scalar, iteration: Int[Array, ""], num_iterations: int) -> Scalar:
+    """Return the step size of an iteration, which decays to zero over all of them where the config says so."""
+    progress = iteration.astype(jnp.float32) / num_iterations if config.learning_rate_decay else 0.0
+    return learning_rate * (1.0 - progress)
+
+
 def _standardize(x: Float[Array, " R"], mask: Array) -> Float[Array, " R"]:
     """Subtract the mean and divide by the standard deviation of the masked entries."""
     mean = jnp.mean(x, where=mask)
@@ -136,8 +147,7 @@ def iterate(
     if config.normalize_advantage:
         decisions = decisions.replace(advantage=_standardize(decisions.advantage, decision))
 
-    progress = state.iteration.astype(jnp.float32) / num_iterations if config.learning_rate_decay else 0.0
-    learning_rate = config.learning_rate * (1.0 - progress)
+    learning_rate = step_size(config, config.learning_rate, state.iteration, num_iterations)
     result = update(policy, config, learning_rate, state.params, state.optimizer, decisions, decision, key_update)
     state = state.replace(
         params=_explore_anew(config, result.params, state.running.env.metrics, running.env.metrics),
