@@ -136,17 +136,20 @@ def peer_loops(arguments: Arguments) -> tuple[list[Loop], dict[str, str]]:
     return loops, remarks
 
 
-def measure_brax(arguments: Arguments) -> tuple[dict[str, Speeds], str]:
-    """Return the speed of Brax's PPO, if it runs, and the remark on it."""
-    from taic_jax.experiments.peers.brax_ppo import DoesNotRunError, ticks_per_second
+def measure_brax(arguments: Arguments) -> tuple[dict[str, Speeds], dict[str, str]]:
+    """Return the speed of Brax's PPO on each pipeline, if it runs, and the remarks on them."""
+    from taic_jax.experiments.peers.brax_ppo import PIPELINES, DoesNotRunError, ticks_per_second
 
     if arguments.task not in peers.BRAX:
-        return {}, "has no such task"
-    try:
-        rounds = ticks_per_second(peers.BRAX[arguments.task], arguments.training)
-    except DoesNotRunError as error:
-        return {}, str(error)
-    return {"brax": Speeds(rounds, float("nan"))}, "spring pipeline; takes no turns with the others"
+        return {}, {"brax": "has no such task"}
+    speeds = {}
+    for pipeline in PIPELINES:
+        try:
+            rounds = ticks_per_second(peers.BRAX[arguments.task], pipeline, arguments.training)
+        except DoesNotRunError as error:
+            return {}, {"brax": str(error)}
+        speeds[f"brax/{pipeline}"] = Speeds(rounds, float("nan"))
+    return speeds, dict.fromkeys(speeds, "takes no turns with the others")
 
 
 def measure(arguments: Arguments, env: envs.Env) -> dict[str, dict[str, Any]]:
@@ -163,8 +166,8 @@ def measure(arguments: Arguments, env: envs.Env) -> dict[str, dict[str, Any]]:
         if isinstance(loop.run, Training | SeedsApart) and HEADLINE in loop.name:
             remarks[loop.name] = f"{loop.run.duration:.1f} ticks a decision"
     if arguments.peers:
-        brax, remarks["brax"] = measure_brax(arguments)
-        speeds |= brax
+        brax, told = measure_brax(arguments)
+        speeds, remarks = speeds | brax, remarks | told
     return {name: row(speeds, name, remarks.get(name, "")) for name in dict.fromkeys([*speeds, *remarks])}
 
 

@@ -123,7 +123,7 @@ def test_brax_that_fails_is_told_in_one_line(monkeypatch):
 
     monkeypatch.setattr("brax.training.agents.ppo.train.train", fail)
     with pytest.raises(brax_ppo.DoesNotRunError) as error:
-        brax_ppo.ticks_per_second("halfcheetah", TINY)
+        brax_ppo.ticks_per_second("halfcheetah", "spring", TINY)
     assert str(error.value) == f"does not run on jax {jax.__version__}: AttributeError: no such function"
 
 
@@ -136,7 +136,7 @@ def test_brax_is_asked_for_the_same_work(monkeypatch):
             settings["progress_fn"](0, {})
 
     monkeypatch.setattr("brax.training.agents.ppo.train.train", train)
-    assert len(brax_ppo.ticks_per_second("halfcheetah", WORK)) == brax_ppo.ITERATIONS
+    assert len(brax_ppo.ticks_per_second("halfcheetah", "spring", WORK)) == brax_ppo.ITERATIONS
     # What Brax makes of an iteration: the ticks of batches of environments, and a step on each, in epochs.
     batches = asked["batch_size"] * asked["num_minibatches"]
     assert batches == asked["num_envs"] == 64

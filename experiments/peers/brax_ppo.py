@@ -1,4 +1,4 @@
-"""Brax's own PPO at the work of ours, on its `spring` pipeline."""
+"""Brax's own PPO at the work of ours, on each of its pipelines."""
 
 import itertools
 import time
@@ -9,6 +9,8 @@ import jax
 from taic_jax.config import PPOConfig
 from taic_jax.envs.third_party import third_party
 
+PIPELINES = ("spring", "positional", "generalized", "mjx")
+"""Brax's engines, from the simplest physics to MuJoCo's."""
 ITERATIONS = 3
 """After the first, which compiles."""
 
@@ -17,7 +19,7 @@ class DoesNotRunError(Exception):
     """Brax's trainer fails on this JAX; one line."""
 
 
-def ticks_per_second(name: str, config: PPOConfig) -> list[float]:
+def ticks_per_second(name: str, pipeline: str, config: PPOConfig) -> list[float]:
     """Train with Brax and return the ticks per second of each iteration but the first, which compiles.
 
     Its loop cannot be entered from outside, so that it takes no turns with others.
@@ -43,7 +45,7 @@ def ticks_per_second(name: str, config: PPOConfig) -> list[float]:
         try:
             # Brax's batches are of environments: all their ticks at once. Each of its iterations is one rollout.
             train.train(
-                envs.get_environment(name, backend="spring"), num_timesteps=ticks * (1 + ITERATIONS),
+                envs.get_environment(name, backend=pipeline), num_timesteps=ticks * (1 + ITERATIONS),
                 num_envs=config.num_envs, episode_length=1000, unroll_length=config.rollout_length,
                 batch_size=max(1, config.num_envs // minibatches), num_minibatches=minibatches,
                 num_updates_per_batch=config.epochs, learning_rate=config.learning_rate,
