@@ -86,7 +86,8 @@ def test_changes_d_and_nothing_else(decoder):
 def test_likelihoods_are_of_the_actions_that_were_taken(decoder):
     """What `_rows` makes of the rollout and its key is what the executor emitted."""
     executor = make(decoder)
-    state = ppo.init(PPO, Forward(), executor, jax.random.key(0))
+    # After an iteration, whose last options go on in the next.
+    state = tune(dataclasses.replace(FINE, learning_rate=jnp.zeros(())), executor, 1)[1][0]
     noisy = fine_tune.NoisyExecutor(executor, FINE.std)
     decide = ppo.as_agent(PPO, executor, state).decide()
     running, ticks = rollout(AutoReset(Forward()), noisy, decide, state.running, ppo.rollout_key(state), T)
