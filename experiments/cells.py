@@ -88,7 +88,7 @@ def flat_config(task: str, strength: str, seed: int, seeds: int) -> Config:
         config,
         collect=CollectConfig(ticks=2 * ticks if strength == "long" else ticks, capacity=MILLION, ppo=ppo),
         options=OptionsConfig(),  # what differs is told below; no preset may change it
-        train=dataclasses.replace(config.train, ticks=ticks, baselines=()),
+        train=dataclasses.replace(config.train, ticks=ticks, baselines=(), fine_tune=FineTuneConfig()),
         evaluate=EvaluateConfig(episodes=20, video_ticks=0),
         seed=seed,
         seeds=seeds,
@@ -107,10 +107,11 @@ def options_config(task: str, method: str, run_dir: Path, seed: int, seeds: int)
     source = run_dir / name_of(task, "strong", seed)
     changes: dict[str, Any] = {"termination": rule, "decoder": decoder} | SETTINGS[decoder] | CONSTRAINTS[constraints]
     changes |= {} if rule == "fixed" else VARIABLE
+    fine_tune = FineTuneConfig(epochs=10 if tuned else 0)
     return dataclasses.replace(
         config,
         options=dataclasses.replace(config.options, experience=(str(source),), **changes),
-        train=dataclasses.replace(config.train, fine_tune=FineTuneConfig(epochs=10) if tuned else FineTuneConfig()),
+        train=dataclasses.replace(config.train, fine_tune=fine_tune),
     )
 
 

@@ -45,7 +45,8 @@ BASELINE = "strong"
 FIELDS = (
     "task", "method", "seeds", "ticks", "pretraining", "iqm", "low", "high", "auc", "auc_low", "auc_high",
     "jump_start", "jump_starts_positive", "ticks_to_threshold", "reached", "improvement", "improvement_low",
-    "improvement_high", "p_holm", "improvement_on_weak", "improvement_at_same_total", "remarks",
+    "improvement_high", "p_holm", "improvement_on_weak", "improvement_at_same_total", "mean", "improvement_of_means",
+    "remarks",
 )  # fmt: skip
 
 
@@ -89,6 +90,7 @@ def numbers(runs: Runs, methods: dict[str, Runs]) -> dict[str, Any]:
     row = {"task": runs.task, "method": runs.method, "seeds": len(last), "ticks": runs.ticks}
     row |= {"pretraining": runs.pretraining, "remarks": "; ".join(runs.remarks)}
     row |= with_interval(last) | with_interval(area, ("auc", "auc_low", "auc_high"))
+    row["mean"] = float(iqm(runs.numbers["mean_option"]))
     if BASELINE not in methods:
         return row
     flat = methods[BASELINE]
@@ -104,6 +106,8 @@ def numbers(runs: Runs, methods: dict[str, Runs]) -> dict[str, Any]:
         row |= {"jump_start": float(np.mean(jump)), "jump_starts_positive": f"{(jump > 0).sum()}/{len(jump)}"}
         p, interval = probability_of_improvement(last, flat.numbers["last"])
         row |= dict(zip(("improvement", "improvement_low", "improvement_high"), (p, *interval), strict=True))
+        means = [each.numbers["mean_option"] for each in (runs, flat)]
+        row["improvement_of_means"] = probability_of_improvement(*means)[0]
         row["p"] = float(stats.mannwhitneyu(last, flat.numbers["last"], alternative="greater").pvalue)
     if "weak" in methods and runs.method not in (BASELINE, "weak"):
         row["improvement_on_weak"] = probability_of_improvement(last, methods["weak"].numbers["last"])[0]

@@ -24,7 +24,7 @@ def made_row(task: str, method: str, seed: int, seeds: int, level: float, **chan
     grid = np.arange(1, 51) * (TICKS // 50)
     last = level + np.arange(seeds)
     curves = {"return": np.outer(last, grid / TICKS).tolist()}
-    numbers = {"first": np.zeros(seeds).tolist(), "last": last.tolist()}
+    numbers = {"first": np.zeros(seeds).tolist(), "last": last.tolist(), "mean_option": (-last).tolist()}
     row = {
         "task": task, "method": method, "seed": seed, "seeds": seeds, "ticks": TICKS, "pretraining": 0,
         "config": "a", "versions": {"jax": "1"}, "stopped": {}, "grid": grid.tolist(), "curves": curves,
@@ -170,7 +170,7 @@ def test_figure_7_marks_what_is_missing(table, tmp_path, monkeypatch):
     numbers = out.with_suffix(".csv").read_text().splitlines()
     options = next(line for line in numbers if ",fixed-open-both," in line)
     assert "1,1,1" in options, "every seed of the one beats every seed of the other"
-    assert options.endswith(",0,4 of 10 seeds"), "but none does at the same total"
+    assert options.endswith(",0,-1002,0,4 of 10 seeds"), "but none does at the same total, nor taking mean options"
 
 
 def test_figures_refuse_an_empty_table(table, capsys):
