@@ -49,15 +49,20 @@ class Runs:
 def difference(config: Config, run_dir: Path) -> dict[str, Any]:
     """Return the fields that are not the default, without the seeds; what is taken from others is named in `run_dir`.
 
-    A field that a later version adds is at its default, and so leaves the hash of an earlier run as it was.
+    A field that a later version adds is at its default, and so leaves the hash of an earlier run as it was. The runs
+    of other seeds take theirs from the runs of those seeds: their names differ in the seed alone, which is left out.
     """
-    default, prefix = dict(walk(Config())), f"{run_dir}/"
+    default = dict(walk(Config()))
     fields = {name: value for name, value in walk(config) if name not in OWN and value != default[name]}
-    return {
-        name: [text.removeprefix(prefix) for text in value] if name == "options.experience"
-        else value.removeprefix(prefix) if name == "options.source" else value
-        for name, value in fields.items()
-    }  # fmt: skip
+
+    def named(text: str) -> str:
+        return text.removeprefix(f"{run_dir}/").removesuffix(f"-{config.seed}")
+
+    if "options.experience" in fields:
+        fields["options.experience"] = [named(text) for text in fields["options.experience"]]
+    if "options.source" in fields:
+        fields["options.source"] = named(fields["options.source"])
+    return fields
 
 
 def config_hash(fields: dict[str, Any]) -> str:

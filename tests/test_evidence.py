@@ -89,6 +89,15 @@ def test_the_hash_tells_configs_apart_but_not_seeds_or_folders(tmp_path):
     assert hashed(at("x"), "x") != hashed(with_fields(at("x"), train__ticks=64), "x")
 
 
+def test_the_runs_of_a_method_on_a_task_are_of_one_config(tmp_path):
+    hashes: dict = {}
+    for cell in all_cells(tmp_path):
+        for task, method, _ in cell.keys:
+            hashes.setdefault((task, method), set()).add(config_hash(difference(cell.config, tmp_path)))
+    assert {len(found) for found in hashes.values()} == {1}
+    assert len(set().union(*hashes.values())) > len(hashes) // 2
+
+
 def test_recovery_by_hand():
     """Iterations of 50 000 ticks; the room changes within the third; the last 100 episodes within 200 000 count."""
     unit = AFTER // 4
