@@ -11,6 +11,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from taic_jax.statistics import iqm, stratified_interval
 
@@ -45,6 +46,7 @@ def interactions(axes: Axes, label: str) -> None:
     """Write interactions in millions or thousands on the x-axis."""
     top = axes.get_xlim()[1]
     unit, letter = (1e6, "M") if top > 1e6 else (1e3, "k")
+    axes.xaxis.set_major_locator(MaxNLocator(5))
     axes.xaxis.set_major_formatter(lambda value, _: f"{value / unit:g} {letter}")
     axes.set_xlabel(label)
 

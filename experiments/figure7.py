@@ -135,6 +135,8 @@ def draw(found: dict[str, tuple[dict[str, Runs], list[str]]], out: Path) -> None
                 shift = runs.pretraining if row else 0
                 flat = "-" not in method
                 draw_curves(axes, runs.grid + shift, runs.curves["return"], COLOURS[method], METHODS[method][0], flat)
+                end = runs.grid[-1] + shift, iqm(runs.numbers["last"])
+                axes.plot(*end, "o", color=COLOURS[method], markeredgecolor="white", markersize=7, zorder=4)
             if not methods:
                 empty(axes)
                 continue
@@ -144,7 +146,8 @@ def draw(found: dict[str, tuple[dict[str, Runs], list[str]]], out: Path) -> None
     for axes in panels[:, 0]:
         axes.set_ylabel("return of an episode")
     lines = {line.get_label(): line for axes in panels[0] for line in axes.get_lines() if line.get_label()[0] != "_"}
-    figure.legend(lines.values(), lines.keys(), loc="outside lower center", ncols=4)
+    title = "curves: while training; dots: evaluated after it"
+    figure.legend(lines.values(), lines.keys(), loc="outside lower center", ncols=len(found), title=title)
     save(figure, out)
 
 
