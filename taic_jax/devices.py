@@ -49,9 +49,15 @@ class Devices:
         return self._send(rows, self._spec)
 
     def take(self, rows: Tree, count: int) -> Tree:
-        """Return the first `count` rows, all but those that `place` added, on every host."""
+        """Return the first `count` rows, all but those that `place` added, on one device of every host.
+
+        What is computed with them later, be it a slice, would otherwise run on all devices and exchange what it needs;
+        on a CPU many such small programs at once can take all threads, and then wait for each other for ever.
+        """
         if jax.process_count() > 1:
             rows = jax.tree.map(on_this_host, self._send(rows, Spec()))
+        elif self.shard != "none":
+            rows = jax.device_put(rows, jax.local_devices()[0])
         return jax.tree.map(lambda x: x if len(x) == count else x[:count], rows)
 
     def compile(self, function: Callable, *args: Any, donate: bool = False) -> Callable:

@@ -111,6 +111,17 @@ def test_each_device_calls_the_engine_with_its_part(shard, monkeypatch):
     assert len(parts) == 6 and sum(parts) == sum(whole) and set(parts) == {whole[0] // 2}
 
 
+@pytest.mark.parametrize("shard", ["seeds", "envs"])
+@pytest.mark.parametrize("count", [3, 4])
+def test_what_is_taken_is_on_one_device_so_that_nothing_is_exchanged_later(shard, count):
+    devices = Devices(shard)
+    rows = jnp.arange(8.0).reshape(4, 2)[:count], jax.random.split(jax.random.key(0), count)
+    taken = devices.take(devices.place(rows), count)
+    for row, back in zip(rows, taken, strict=True):
+        assert back.devices() == {jax.local_devices()[0]}
+        assert (back == row).all()
+
+
 def test_cores_of_a_cpu_become_devices_no_more_than_rows():
     program = "import sys; from taic_jax.devices import open_devices; import jax; "
     program += "print(*[open_devices(sys.argv[1], int(sys.argv[2])), jax.device_count()])"
