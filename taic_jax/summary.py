@@ -106,12 +106,17 @@ def _version(name: str) -> str | None:
 
 
 def commit() -> str | None:
-    """Return the git commit of the checkout this package runs from, with `-dirty` if it was changed, or None."""
-    command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--abbrev=40"]
+    """Return the git commit of the checkout this package runs from, with `-dirty` if the package was changed, or None.
+
+    Other files of the checkout, as tables that runs are written to, change nothing of what runs.
+    """
+    git = ["git", "-C", str(Path(__file__).parent)]
+    commands = [*git, "rev-parse", "HEAD"], [*git, "status", "--porcelain", "--untracked-files=no", "."]
     try:
-        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+        head, changed = (subprocess.run(line, capture_output=True, text=True, check=True).stdout for line in commands)
     except (OSError, subprocess.CalledProcessError):
         return None
+    return head.strip() + ("-dirty" if changed else "")
 
 
 def write_video(run: Run, env: Env, agent: Agent) -> None:

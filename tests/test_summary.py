@@ -1,16 +1,19 @@
 """What a run's summary says, by hand."""
 
+import subprocess
+
 import numpy as np
 import pytest
 
+from taic_jax import summary
 from taic_jax.summary import _durations, _method
 
 
 def test_durations_by_hand():
     # Seed 0: 1 option of one tick, 3 of three; seed 1: 2 of one, 2 of two, 2 of three.
-    summary = _durations(np.array([[1.0, 0.0, 3.0], [2.0, 2.0, 2.0]]))
-    assert summary["per_seed"] == [2.5, 2.0] and summary["mean"] == 2.25
-    assert summary["histogram"] == pytest.approx([0.3, 0.2, 0.5])  # of all ten options
+    durations = _durations(np.array([[1.0, 0.0, 3.0], [2.0, 2.0, 2.0]]))
+    assert durations["per_seed"] == [2.5, 2.0] and durations["mean"] == 2.25
+    assert durations["histogram"] == pytest.approx([0.3, 0.2, 0.5])  # of all ten options
 
 
 def test_durations_of_a_method_are_those_of_the_exploring_policy():
@@ -25,3 +28,20 @@ def test_durations_of_a_method_are_those_of_the_exploring_policy():
     assert method["duration"]["mean"] == 1.75 and method["duration"]["histogram"] == [0.25, 0.75]
     assert set(method["metrics"]) == {"return", "length"}
     assert "durations" in last["return_mean_option"]
+
+
+def test_commit_is_dirty_where_the_package_was_changed_and_nowhere_else(tmp_path, monkeypatch):
+    package, table = tmp_path / "taic_jax", tmp_path / "table.jsonl"
+    package.mkdir()
+    module = package / "summary.py"
+    for file in (module, table):
+        file.write_text("")
+    git = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b.c"]
+    for line in (["init", "-q"], ["add", "."], ["commit", "-qm", "first"]):
+        subprocess.run([*git, *line], check=True)
+    monkeypatch.setattr(summary, "__file__", str(module))
+    head = subprocess.run([*git, "rev-parse", "HEAD"], check=True, capture_output=True, text=True).stdout.strip()
+    table.write_text("a row\n")
+    assert summary.commit() == head
+    module.write_text("changed\n")
+    assert summary.commit() == f"{head}-dirty"
