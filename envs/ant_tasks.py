@@ -63,7 +63,7 @@ class AntArena(Locomotion):
       name: the task's.
       arena: the room.
       body: `gym`, the ant of `ant`; or `hiro`, with a fifth of its strength and ticks twice as long, 500 of them.
-      goal: `fixed`, or `uniform` in the room, as HIRO trains in its maze.
+      goal: `fixed`; `near`, where the arena has one; or `uniform` in the room, as HIRO trains in its maze.
       backend: see `make_physics`.
       num_threads: see `make_physics`.
 
@@ -82,8 +82,11 @@ class AntArena(Locomotion):
     ):
         if body not in ("gym", "hiro"):
             raise UnknownNameError("body", body, ("gym", "hiro"))
-        if goal not in ("fixed", "uniform"):
-            raise UnknownNameError("goal", goal, ("fixed", "uniform"))
+        goals = ("fixed", "uniform") if arena.near_goal is None else ("fixed", "near", "uniform")
+        if goal not in goals:
+            raise UnknownNameError("goal", goal, goals)
+        if goal == "near":
+            arena = dataclasses.replace(arena, goal=arena.near_goal)
         self.arena, self.body, self.uniform_goal = arena, body, goal == "uniform"
         robot = dataclasses.replace(
             ROBOTS["brax"]["ant"], start_in_default_pose=body == "hiro", iterations=4, ls_iterations=8

@@ -54,11 +54,17 @@ class Arena:
     room: tuple[float, float, float, float]  # x_low, y_low, x_high, y_high
     solids: tuple[tuple[float, float, float, float], ...]  # likewise
     goal: tuple[float, ...]  # 2 coordinates, or 3 where height counts
+    near_goal: tuple[float, ...] | None = None  # one that nothing stands before
     ground: float = 0.0  # height of the ground on which the ant starts
     block: Block | None = None
 
 
-MAZE = Arena(room=(-4.0, -4.0, 20.0, 20.0), solids=((-4.0, 4.0, 12.0, 12.0),), goal=(0.0, 16.0))
+MAZE = Arena(
+    room=(-4.0, -4.0, 20.0, 20.0),
+    solids=((-4.0, 4.0, 12.0, 12.0),),
+    goal=(0.0, 16.0),
+    near_goal=(16.0, 0.0),  # as far off, but at the end of the first corridor
+)
 PUSH = Arena(
     room=(-12.0, -4.0, 12.0, 20.0),
     solids=((4.0, -4.0, 12.0, 4.0), (-12.0, 12.0, -4.0, 20.0), (4.0, 12.0, 12.0, 20.0)),

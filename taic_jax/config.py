@@ -33,8 +33,8 @@ class EnvConfig:
     """MJCF and rules of half_cheetah, ant, hopper and walker2d: Brax's, or Gymnasium's own."""
     body: Literal["gym", "hiro"] = "gym"
     """Ant of ant_maze, ant_push and ant_fall: the one of ant, or HIRO's weaker one."""
-    goal: Literal["fixed", "uniform"] = "fixed"
-    """Goal of ant_maze: always the same, or drawn in each episode."""
+    goal: Literal["fixed", "near", "uniform"] = "fixed"
+    """Goal of ant_maze: behind the walls, at the end of the first corridor, or drawn in each episode."""
     change_after: int = 0
     """Episodes of each environment after which the room of nav2d changes; 0 for never."""
 

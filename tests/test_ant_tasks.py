@@ -8,9 +8,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from taic_jax.envs import AutoReset, UnknownNameError, make_env
+from taic_jax.envs import AntArena, AutoReset, UnknownNameError, make_env
 from taic_jax.envs.ant_tasks import heading, wrapped
-from taic_jax.envs.arenas import outside
+from taic_jax.envs.arenas import PUSH, outside
 from taic_jax.envs.third_party import third_party
 
 ARENAS = ("ant_maze", "ant_push", "ant_fall")
@@ -166,6 +166,20 @@ def test_uniform_goals_fill_the_maze_and_are_observed():
     np.testing.assert_allclose(
         state.physics.closest, np.linalg.norm(goal - state.physics.qpos[:, :2], axis=1), rtol=1e-5
     )
+
+
+def test_near_goal_is_straight_ahead_and_the_fixed_one_behind_a_wall():
+    """Walls between start and goal, and what is paid for standing at the goal and at the start."""
+    for goal, expected, hidden in (("near", (16.0, 0.0), False), ("fixed", (0.0, 16.0), True)):
+        env, _, step = task("ant_maze", goal=goal)
+        assert env.arena.goal == expected
+        way = np.zeros((100, env.model.nq)) + np.linspace(0, 1, 100)[:, None] * np.resize((*expected, 0), env.model.nq)
+        assert (outside(env.arena, way) > 0) == hidden
+        state = step(placed(start("ant_maze", 2, goal=goal), [[*expected, 0.55], [0, 0, 0.55]]), jnp.zeros((2, 8)))
+        np.testing.assert_allclose(state.reward, [0, -16], atol=0.1)
+        np.testing.assert_array_equal(state.metrics["success"], [1, 0])
+    with pytest.raises(UnknownNameError, match="goal"):
+        AntArena("ant_push", PUSH, goal="near")
 
 
 def test_hiros_body_is_weaker_and_slower():
