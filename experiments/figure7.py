@@ -8,7 +8,7 @@ Reads the table alone. A method with fewer seeds than it needs is marked on its 
 import csv
 import dataclasses
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -162,23 +162,42 @@ def write_numbers(rows: list[dict[str, Any]], fields: Sequence[str], out: Path) 
         print("  ".join(f"{name} {row[name]}" for name in fields if row.get(name) not in (None, "")))
 
 
-def main(args: Sequence[str] | None = None) -> None:
-    """Draw the figure and write its numbers."""
-    arguments = tyro.cli(Arguments, args=args)
+def make_figure(
+    figure: str,
+    arguments: Any,
+    methods: dict[str, tuple[str, int]],
+    draw: Callable[[dict[str, tuple[dict[str, Runs], list[str]]], Path], None],
+    numbers: Callable[[Runs, dict[str, Runs]], dict[str, Any]],
+    fields: Sequence[str],
+) -> None:
+    """Draw a figure of several tasks and write its numbers.
+
+    Args:
+        figure: its number.
+        arguments: `table`, `out` and `tasks`.
+        methods: of each task, with label and fewest seeds.
+        draw: the picture, from what `read_methods` gives for each task.
+        numbers: of one method beside the others on its task.
+        fields: of the table of numbers.
+    """
     try:
         table = read_table(arguments.table)
-        found = {task: read_methods(table, task, METHODS) for task in arguments.tasks}
-        if not any(methods for methods, _ in found.values()):
-            raise TableError(
-                f"{arguments.table}: no row of figure 7; python -m taic_jax.experiments.evidence makes them"
-            )
+        found = {task: read_methods(table, task, methods) for task in arguments.tasks}
+        if not any(held for held, _ in found.values()):
+            expected = f"{arguments.table}: no row of figure {figure}"
+            raise TableError(f"{expected}; python -m taic_jax.experiments.evidence makes them")
     except TableError as error:
-        print(f"figure7: {error}", file=sys.stderr)
+        print(f"figure{figure}: {error}", file=sys.stderr)
         raise SystemExit(2) from None
     draw(found, arguments.out)
-    rows = [numbers(runs, methods) for methods, _ in found.values() for runs in methods.values()]
+    rows = [numbers(runs, held) for held, _ in found.values() for runs in held.values()]
     adjust(rows)
-    write_numbers(rows, FIELDS, arguments.out.with_suffix(".csv"))
+    write_numbers(rows, fields, arguments.out.with_suffix(".csv"))
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Draw figure 7 and write its numbers."""
+    make_figure("7", tyro.cli(Arguments, args=args), METHODS, draw, numbers, FIELDS)
 
 
 if __name__ == "__main__":

@@ -7,7 +7,6 @@ seed's success is its share of evaluation episodes under its mean options.
 """
 
 import dataclasses
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -30,8 +29,8 @@ from taic_jax.experiments.drawing import (
     save,
     styled,
 )
-from taic_jax.experiments.figure7 import adjust, read_methods, with_interval, write_numbers
-from taic_jax.experiments.table import TABLE, Runs, TableError, read_table
+from taic_jax.experiments.figure7 import make_figure, with_interval
+from taic_jax.experiments.table import TABLE, Runs
 from taic_jax.statistics import probability_of_improvement
 
 SEEDS = 10
@@ -103,21 +102,9 @@ def draw(found: dict[str, tuple[dict[str, Runs], list[str]]], out: Path) -> None
 
 
 def main(args: Sequence[str] | None = None) -> None:
-    """Draw the figure and write its numbers."""
-    arguments = tyro.cli(Arguments, args=args)
+    """Draw figure 8 and write its numbers."""
     methods = {name: (label, SEEDS) for name, (label, _) in TRANSFERRED.items()}
-    try:
-        table = read_table(arguments.table)
-        found = {task: read_methods(table, task, methods) for task in arguments.tasks}
-        if not any(held for held, _ in found.values()):
-            raise TableError(f"{arguments.table}: no row of figure 8; taic_jax.experiments.evidence makes them")
-    except TableError as error:
-        print(f"figure8: {error}", file=sys.stderr)
-        raise SystemExit(2) from None
-    draw(found, arguments.out)
-    rows = [numbers(runs, held) for held, _ in found.values() for runs in held.values()]
-    adjust(rows)
-    write_numbers(rows, FIELDS, arguments.out.with_suffix(".csv"))
+    make_figure("8", tyro.cli(Arguments, args=args), methods, draw, numbers, FIELDS)
 
 
 if __name__ == "__main__":

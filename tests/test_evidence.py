@@ -10,7 +10,7 @@ import pytest
 from tiny_runs import CONFIG, PPO, tiny_steps, with_fields
 
 from taic_jax.config import Config
-from taic_jax.experiments import drawing, evidence, figure5c, figure6, figure7, figure8, spaces
+from taic_jax.experiments import drawing, evidence, figure5c, figure6, figure7, figure8, option_table, spaces
 from taic_jax.experiments.cells import Cell, all_cells
 from taic_jax.experiments.recovery import AFTER, recovery_of
 from taic_jax.experiments.table import TableError, append_row, config_hash, difference, read_table, row_of, select
@@ -182,8 +182,25 @@ def test_figure_7_marks_what_is_missing(table, tmp_path, monkeypatch):
     assert options.endswith(",0,-1002,0,4 of 10 seeds"), "but none does at the same total, nor taking mean options"
 
 
+def test_option_table_has_a_line_for_every_kind_that_was_run(table, tmp_path):
+    """Flat PPO returns 100 to 104, options 101 to 105."""
+    rows = [made_row("ant", "strong", 0, 5, 100.0), made_row("ant", "predict-closed-both", 0, 5, 101.0)]
+    rows[1]["numbers"] |= {"space/kl": [1.5] * 5, "duration": [4.0] * 5}
+    rows.append(made_row("hopper", "fixed-closed-both-tuned", 0, 2, 7.0))
+    option_table.main(["--table", written(table, *rows), "--out", str(tmp_path / "options.md")])
+    lines = [line.split(" | ") for line in (tmp_path / "options.md").read_text().splitlines() if line.startswith("| ")]
+    headings, flat, options, tuned = lines[0], *lines[2:]
+    assert flat[:3] == ["| ant", "flat PPO", ""] and tuned[:4] == ["| hopper", "fixed", "closed, fine-tuned", "both"]
+    row = dict(zip(headings, options, strict=True))
+    assert (row["termination"], row["decoder"], row["constraints"], row["seeds"]) == ("predict", "closed", "both", "5")
+    values = np.arange(5)
+    wins = np.mean(values[:, None] + 1 > values) + np.mean(values[:, None] + 1 == values) / 2
+    assert row["P"] == f"{wins:.2f}" and row["return"].startswith("103 (10"), "seeds 102 to 104 are the middle half"
+    assert row["KL, nats"] == "1.5" and row["ticks an option"] == "4" and row["active dimensions"] == ""
+
+
 def test_figures_refuse_an_empty_table(table, capsys):
-    for figure in (figure5c, figure6, figure7, figure8):
+    for figure in (figure5c, figure6, figure7, figure8, option_table):
         with pytest.raises(SystemExit) as error:
             figure.main(["--table", str(table)])
         assert error.value.code == 2

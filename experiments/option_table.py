@@ -1,0 +1,112 @@
+"""One table of every kind of options on every robot: returns, durations, and measures of the option space.
+
+python -m taic_jax.experiments.option_table
+
+Reads the table of finished runs alone, and writes Markdown.
+"""
+
+import dataclasses
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import tyro
+
+from taic_jax.experiments.cells import FLAT, METHODS, OTHERS, ROBOTS
+from taic_jax.experiments.drawing import RESULTS
+from taic_jax.experiments.figure7 import BASELINE, read_methods, with_interval
+from taic_jax.experiments.spaces import PREFIX
+from taic_jax.experiments.table import TABLE, Runs, TableError, read_table
+from taic_jax.files import save_text
+from taic_jax.statistics import probability_of_improvement
+
+# Heading, and the number per seed that stands below it.
+COLUMNS = {
+    "untrained": "first",
+    "return": "last",
+    "of mean options": "mean_option",
+    "ticks an option": "duration",
+    "KL, nats": f"{PREFIX}kl",
+    "active dimensions": f"{PREFIX}active_dimensions",
+    "distance correlation": f"{PREFIX}prior/one/distance_correlation",
+    "the same, many states": f"{PREFIX}prior/many/distance_correlation",
+    "R² of the change": f"{PREFIX}window/mlp_r2/change",
+    "R² of the first state": f"{PREFIX}window/mlp_r2/start",
+}
+KINDS = ("task", "termination", "decoder", "constraints", "seeds")
+NOTE = """Interquartile means over seeds and their 95 % intervals, of the runs of figures 6 and 7; a cell that is missing has no
+run yet. *untrained* and *return* are those of the policy as it explores, *P* is the probability that a seed returns more
+than one of strong flat PPO at the same ticks of the task. Distance correlation is that of the code and the state change
+of options from the prior, executed from one state, and from many; R² is that of an MLP fitted to the codes of windows.
+
+Made by `python -m taic_jax.experiments.option_table`.
+"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+    """Write the table of all kinds of options."""
+
+    table: Path = TABLE
+    """The table of finished runs."""
+    out: Path = RESULTS / "options.md"
+    """The file, in Markdown."""
+
+
+def kind(method: str) -> list[str]:
+    """Return the words for a method's termination, decoder and constraints."""
+    if method in FLAT:
+        return [METHODS[method][0], "", ""]
+    rule, decoder, constraints, *tuned = method.split("-")
+    return [rule, ", ".join([decoder, *("fine-tuned" for _ in tuned)]), constraints]
+
+
+def cell(values: np.ndarray | None) -> str:
+    """Return an interquartile mean with its interval, to three digits or whole numbers; nothing where there is none."""
+    if values is None:
+        return ""
+    mean, low, high = (f"{x:.0f}" if abs(x) >= 100 else f"{x:.2g}" for x in with_interval(values).values())
+    return mean if low == high else f"{mean} ({low} … {high})"
+
+
+def line(runs: Runs, flat: Runs | None) -> list[str]:
+    """Return the cells of one method on one task."""
+    cells = [runs.task, *kind(runs.method), str(len(runs.seeds))]
+    p = (
+        ""
+        if flat in (None, runs)
+        else f"{probability_of_improvement(runs.numbers['last'], flat.numbers['last'])[0]:.2f}"
+    )
+    return [*cells, p, *(cell(runs.numbers.get(name)) for name in COLUMNS.values())]
+
+
+def as_markdown(lines: Sequence[Sequence[str]]) -> str:
+    """Return the table with its headings."""
+    headings = [*KINDS, "P", *COLUMNS]
+    rows = [headings, ["---"] * len(headings), *lines]
+    return "".join(f"| {' | '.join(row)} |\n" for row in rows)
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Write the table."""
+    arguments = tyro.cli(Arguments, args=args)
+    lines = []
+    try:
+        rows = read_table(arguments.table)
+        for task in ROBOTS:
+            found, _ = read_methods(rows, task, METHODS | OTHERS)
+            lines += [line(runs, found.get(BASELINE)) for runs in found.values()]
+        if not lines:
+            raise TableError(
+                f"{arguments.table}: no run of a robot; python -m taic_jax.experiments.evidence makes them"
+            )
+    except TableError as error:
+        print(f"option_table: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
+    save_text(arguments.out, f"# Options, of every kind\n\n{as_markdown(lines)}\n{NOTE}")
+    print(arguments.out)
+
+
+if __name__ == "__main__":
+    main()
