@@ -63,7 +63,8 @@ OTHERS = {
     if f"{rule}-{decoder}-{constraints}" not in METHODS
 }
 # Of figure 8: the method's name, and of figure 5c: the stage of the run that trains it.
-TRANSFERRED = {"options": ("options of Ant", "train"), "flat": ("flat PPO", "flat"),
+TRANSFERRED = {"open": ("options of Ant, open loop", "train"), "closed": ("options of Ant, closed loop", "train"),
+               "tuned": ("options of Ant, fine-tuned", "train"), "flat": ("flat PPO", "flat"),
                "transfer": ("flat PPO from Ant's policy", "transfer")}  # fmt: skip
 RECOVERING = {"options": ("options", "train"), "flat": ("flat PPO", "flat")}
 
@@ -137,26 +138,49 @@ def robots(task: str, run_dir: Path, chunk: int = 10) -> list[Cell]:
 
 
 def transfers(task: str, run_dir: Path, seeds: int = 10) -> list[Cell]:
-    """Return the runs of figure 8 on one task; options and policy are those of the ant's run `ant/source`."""
-    source = dataclasses.replace(load_config("ant"), seed=FIRST_SEED, seeds=seeds)
+    """Return the runs of figure 8 on one task; options and policy are of the ant's run `ant/source`."""
+    source = one_iteration(dataclasses.replace(load_config("ant"), seed=FIRST_SEED, seeds=seeds))
+    closed = dataclasses.replace(OptionsConfig(), decoder="closed", **SETTINGS["closed"])
+    opened = dataclasses.replace(OptionsConfig(), decoder="open", **SETTINGS["open"])
+    folders = str(run_dir / "ant/source"), str(run_dir / "ant/source-open")
+    sources = [
+        Cell("ant/source", dataclasses.replace(source, options=closed), {}, "8"),
+        Cell("ant/source-open", with_options(source, opened, experience=folders[:1]), {}, "8"),
+    ]
     config = load_config(f"transfer_{task}")
     config = dataclasses.replace(
-        config,
-        options=dataclasses.replace(config.options, source=str(run_dir / "ant/source")),
-        evaluate=EvaluateConfig(episodes=20, video_ticks=0),
-        seed=FIRST_SEED,
-        seeds=seeds,
+        config, evaluate=EvaluateConfig(episodes=20, video_ticks=0), seed=FIRST_SEED, seeds=seeds
     )
-    stages = {method: stage for method, (_, stage) in TRANSFERRED.items()}
-    return [Cell("ant/source", source, {}, "8"), Cell(f"{task}/transfer", config, stages, "8")]
+    alone = dataclasses.replace(config, train=dataclasses.replace(config.train, baselines=()))
+    tuned = dataclasses.replace(alone, train=dataclasses.replace(alone.train, fine_tune=FineTuneConfig(epochs=10)))
+    configs = {
+        "closed": (with_options(config, closed, source=folders[0]), ("closed", "flat", "transfer")),
+        "tuned": (with_options(tuned, closed, source=folders[0]), ("tuned",)),
+        "open": (with_options(alone, opened, source=folders[1]), ("open",)),
+    }
+    return sources + [
+        Cell(f"{task}/{name}", each, {method: TRANSFERRED[method][1] for method in methods}, "8")
+        for name, (each, methods) in configs.items()
+    ]
+
+
+def one_iteration(config: Config) -> Config:
+    """Return the config of a run that nobody asks for its policy over options: of one iteration, and no baseline."""
+    ppo = config.train.ppo
+    train = dataclasses.replace(
+        config.train, baselines=(), ticks=ppo.num_envs * ppo.rollout_length, fine_tune=FineTuneConfig()
+    )
+    return dataclasses.replace(config, train=train)
+
+
+def with_options(config: Config, options: OptionsConfig, **changes: Any) -> Config:
+    """Return the config with these options, and these fields of them changed."""
+    return dataclasses.replace(config, options=dataclasses.replace(options, **changes))
 
 
 def recovery(run_dir: Path, seeds: int = 50) -> list[Cell]:
     """Return the runs of figure 5: options of the room, and recovery after it changes."""
-    source = dataclasses.replace(load_config("nav2d"), seed=FIRST_SEED, seeds=seeds)
-    ppo = source.train.ppo  # nothing needs its policy over options: one iteration
-    train = dataclasses.replace(source.train, baselines=(), ticks=ppo.num_envs * ppo.rollout_length)
-    source = dataclasses.replace(source, train=train)
+    source = one_iteration(dataclasses.replace(load_config("nav2d"), seed=FIRST_SEED, seeds=seeds))
     config = load_config("nav2d_change")
     experience = (str(run_dir / "nav2d/source"),)
     config = dataclasses.replace(

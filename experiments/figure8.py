@@ -1,4 +1,4 @@
-"""Figure 8: options of Ant, unchanged, on its harder tasks, and the numbers of claim C3.
+"""Figure 8: options of Ant, as they are or fine-tuned, on its harder tasks, and the numbers of claim C3.
 
 python -m taic_jax.experiments.figure8
 
@@ -19,6 +19,8 @@ from taic_jax.experiments.cells import TRANSFERRED, TRANSFERS
 from taic_jax.experiments.drawing import (
     BLACK,
     BLUE,
+    ORANGE,
+    PURPLE,
     RED,
     RESULTS,
     draw_curves,
@@ -34,7 +36,8 @@ from taic_jax.experiments.table import TABLE, Runs
 from taic_jax.statistics import probability_of_improvement
 
 SEEDS = 10
-COLOURS = {"options": RED, "flat": BLACK, "transfer": BLUE}
+COLOURS = {"open": ORANGE, "closed": RED, "tuned": PURPLE, "flat": BLACK, "transfer": BLUE}
+BASELINES = ("flat", "transfer")
 # Of the evaluation: name in the row, name in the table of numbers.
 MEASURES = {"final/success": "success", "final/closest_approach": "closest_approach", "mean/upside_down": "upside_down"}
 FIELDS = (
@@ -65,8 +68,8 @@ def numbers(runs: Runs, methods: dict[str, Runs]) -> dict[str, Any]:
         success = runs.numbers["final/success"]
         row |= {"seeds_at_goal": f"{(success >= 0.5).sum()}/{len(success)}"}
         row |= {"success_per_seed": " ".join(f"{x:.2g}" for x in success)}
-    others = [methods[name] for name in ("flat", "transfer") if name in methods]
-    if runs.method == "options" and others:
+    others = [methods[name] for name in BASELINES if name in methods]
+    if runs.method not in BASELINES and others:
         compared = [(*probability_of_improvement(last, x.numbers["last"]), x) for x in others]
         p, interval, worse = min(compared, key=lambda c: c[0])
         row |= dict(zip(("improvement", "improvement_low", "improvement_high"), (p, *interval), strict=True))
@@ -84,7 +87,7 @@ def draw(found: dict[str, tuple[dict[str, Runs], list[str]]], out: Path) -> None
             held = {method: runs for method, runs in methods.items() if name in runs.curves}
             for method, runs in held.items():
                 draw_curves(
-                    axes, runs.grid, runs.curves[name], COLOURS[method], TRANSFERRED[method][0], method != "options"
+                    axes, runs.grid, runs.curves[name], COLOURS[method], TRANSFERRED[method][0], method in BASELINES
                 )
             if held:
                 axes.set_xlim(left=0)

@@ -1,5 +1,6 @@
 """Evidence: what is run and what is not, the table of finished runs, and what figures refuse or mark."""
 
+import csv
 import dataclasses
 import json
 from pathlib import Path
@@ -237,6 +238,27 @@ def test_figure_6_draws_what_the_table_holds_and_marks_the_rest(table, tmp_path,
     lines = out.with_suffix(".csv").read_text().splitlines()
     assert lines[1] == "half_cheetah,fixed-open-none,10,prior/one/distance_correlation,0.2,0.2,0.2,"
     assert len(lines) == 1 + 2 * len(figure6.MEASURES)
+
+
+def test_figure_8_compares_options_with_the_better_baseline(table, tmp_path):
+    """Options return 10 to 14: more than flat PPO's 0 to 4, less than 20 to 24 of flat PPO from Ant's policy."""
+    levels = {"flat": 0.0, "transfer": 20.0, "closed": 10.0}
+    rows = [made_row("ant_maze", method, 0, 5, level) for method, level in levels.items()]
+    for row, share in zip(rows, (0.0, 1.0, 0.4), strict=True):
+        row["numbers"] |= {"final/success": [share] * 4 + [1.0]}
+        row["curves"]["mean/success"] = row["curves"]["return"]
+    out = tmp_path / "figure8.png"
+    figure8.main(["--table", written(table, *rows), "--out", str(out), "--tasks", "ant_maze", "ant_turn"])
+    assert out.stat().st_size > 10_000
+    with out.with_suffix(".csv").open() as file:
+        numbers = {row["method"]: row for row in csv.DictReader(file)}
+    assert [numbers[name]["improvement"] for name in ("closed", "flat", "transfer")] == ["0", "", ""]
+    assert {name: row["seeds_at_goal"] for name, row in numbers.items()} == {
+        "flat": "1/5",
+        "transfer": "5/5",
+        "closed": "1/5",
+    }
+    assert numbers["closed"]["remarks"] == "5 of 10 seeds" and float(numbers["closed"]["success"]) == 0.52
 
 
 def test_colours_of_near_points_are_alike():
