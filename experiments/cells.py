@@ -149,7 +149,11 @@ def transfers(task: str, run_dir: Path, seeds: int = 10) -> list[Cell]:
     ]
     config = load_config(f"transfer_{task}")
     config = dataclasses.replace(
-        config, evaluate=EvaluateConfig(episodes=20, video_ticks=0), seed=FIRST_SEED, seeds=seeds
+        config,
+        train=dataclasses.replace(config.train, fine_tune=FineTuneConfig()),
+        evaluate=EvaluateConfig(episodes=20, video_ticks=0),
+        seed=FIRST_SEED,
+        seeds=seeds,
     )
     alone = dataclasses.replace(config, train=dataclasses.replace(config.train, baselines=()))
     tuned = dataclasses.replace(alone, train=dataclasses.replace(alone.train, fine_tune=FineTuneConfig(epochs=10)))
