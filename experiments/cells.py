@@ -21,7 +21,7 @@ RULES, DECODERS = ("fixed", "output", "predict"), ("open", "closed")
 # Found by `experiments.option_search`, whose log is results/option_search.csv. Steps and step size in closed loop are
 # of a sweep over 3 seeds of HalfCheetah.
 # P is surprised far more often where options are executed than on what it learnt from: with a quantile of the latter
-# options last 2 ticks, with this error, in standard deviations of the state change, about 5 (results/delta_search.csv).
+# options last 2 ticks, with this error about 5 (results/delta_search.csv).
 VARIABLE: dict[str, dict[str, Any]] = {
     "fixed": {},
     "output": {"length": 10},
@@ -122,11 +122,8 @@ def options_config(task: str, method: str, run_dir: Path, seed: int, seeds: int)
     changes |= EXCEPTIONS.get((task, decoder), {})
     changes |= VARIABLE[rule]
     fine_tune = FineTuneConfig(epochs=10 if tuned else 0)
-    return dataclasses.replace(
-        config,
-        options=dataclasses.replace(config.options, experience=(str(source),), **changes),
-        train=dataclasses.replace(config.train, fine_tune=fine_tune),
-    )
+    config = dataclasses.replace(config, train=dataclasses.replace(config.train, fine_tune=fine_tune))
+    return with_options(config, config.options, experience=(str(source),), **changes)
 
 
 def robots(task: str, run_dir: Path, chunk: int = 10) -> list[Cell]:

@@ -145,8 +145,8 @@ def row_of(folder: Path, run_dir: Path, method: str, stage: str) -> dict[str, An
 
 
 def curves_of(rows: Sequence[dict[str, Any]], stage: str, grid: np.ndarray) -> dict[str, list]:
-    """Return the return and the task's metrics while training [K, G]."""
-    names = [name for name in rows[0] if name == f"{stage}/return" or name.startswith(f"{stage}/mean/")]
+    """Return what figures draw of the training [K, G]: the return, and the share of ticks at the goal."""
+    names = [name for name in (f"{stage}/return", f"{stage}/mean/success") if name in rows[0]]
     return {
         name.removeprefix(f"{stage}/"): on_grid(rows, np.array([row[name] for row in rows], float).T, grid).tolist()
         for name in names
