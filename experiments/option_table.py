@@ -35,10 +35,11 @@ COLUMNS = {
     "R² of the first state": f"{PREFIX}window/mlp_r2/start",
 }
 KINDS = ("task", "termination", "decoder", "constraints", "seeds")
-NOTE = """Interquartile means over seeds and their 95 % intervals, of the runs of figures 6 and 7; a cell that is missing has no
-run yet. *untrained* and *return* are those of the policy as it explores, *P* is the probability that a seed returns more
-than one of strong flat PPO at the same ticks of the task. Distance correlation is that of the code and the state change
-of options from the prior, executed from one state, and from many; R² is that of an MLP fitted to the codes of windows.
+NOTE = """Interquartile means over seeds and their 95 % intervals, of the runs of figures 6 and 7; a cell that is
+missing has no run yet. *untrained* and *return* are those of the policy as it explores, *P* is the probability that a
+seed returns more than one of strong flat PPO at the same ticks of the task. Distance correlation is that of the code
+and the state change of options from the prior, executed from one state, and from many; R² is that of an MLP fitted to
+the codes of windows.
 
 Made by `python -m taic_jax.experiments.option_table`.
 """
