@@ -116,7 +116,7 @@ def make_env(
       pipeline: physics of `brax:NAME`: `spring`, `positional`, `generalized` or `mjx`.
       model: MJCF and rules of the running robots: `brax`, or `gym` for Gymnasium's own.
       body: of the ant in an arena: `gym`, the one of `ant`, or `hiro`.
-      goal: of the maze: `fixed`, `near`, or `uniform`.
+      goal: of the maze: `fixed`, `near`, or `uniform` while training.
       change_after: episodes after which the room of `nav2d` changes; 0 for never.
 
     Raises:

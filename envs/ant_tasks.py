@@ -1,5 +1,6 @@
 """What the paper's options are carried to: an ant that turns, and ants in a maze, before a block and a chasm."""
 
+import copy
 import dataclasses
 
 import jax
@@ -63,7 +64,8 @@ class AntArena(Locomotion):
       name: the task's.
       arena: the room.
       body: `gym`, the ant of `ant`; or `hiro`, with a fifth of its strength and ticks twice as long, 500 of them.
-      goal: `fixed`; `near`, where the arena has one; or `uniform` in the room, as HIRO trains in its maze.
+      goal: `fixed`; `near`, where the arena has one; or, as in HIRO's maze, `uniform` in the room while training and
+        fixed in evaluation.
       backend: see `make_physics`.
       num_threads: see `make_physics`.
 
@@ -95,6 +97,15 @@ class AntArena(Locomotion):
         super().__init__(name, robot, backend, num_threads)
         self.proprioceptive_size = ANT_QPOS - robot.num_unobserved + ANT_QVEL
         self.proprioception = "ant" if body == "gym" else "hiro_ant"
+
+    @property
+    def evaluated(self) -> "AntArena":
+        """This arena with its fixed goal."""
+        if not self.uniform_goal:
+            return self
+        arena = copy.copy(self)
+        arena.uniform_goal = False
+        return arena
 
     def reset(self, key: Key[Array, ""]) -> State:
         """Start near the origin with Gym's noise, the block where it belongs."""

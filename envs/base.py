@@ -43,6 +43,11 @@ class Env(abc.ABC):
     episode_length: int  # ticks
     dt: float  # seconds a tick
 
+    @property
+    def evaluated(self) -> "Env":
+        """The task as evaluation sets it: this one, but where training draws what evaluation keeps fixed."""
+        return self
+
     @abc.abstractmethod
     def reset(self, key: Key[Array, ""]) -> State:
         """Draw the first state of an episode; consumes the key."""

@@ -22,6 +22,11 @@ class Wrapper(Env):
             raise AttributeError(name)
         return getattr(self.env, name)
 
+    @property
+    def evaluated(self) -> Env:
+        """Wrap the inner environment as evaluation sets it."""
+        return type(self)(self.env.evaluated)
+
     def reset(self, key: Key[Array, ""]) -> State:
         """Reset the inner environment."""
         return self.env.reset(key)
@@ -45,6 +50,11 @@ class TimeLimit(Wrapper):
     def __init__(self, env: Env, ticks: int):
         super().__init__(env)
         self.episode_length = ticks
+
+    @property
+    def evaluated(self) -> Env:
+        """Limit the inner environment as evaluation sets it."""
+        return TimeLimit(self.env.evaluated, self.episode_length)
 
     def reset(self, key: Key[Array, ""]) -> State:
         """Reset with the count of ticks at zero."""

@@ -34,7 +34,8 @@ class EnvConfig:
     body: Literal["gym", "hiro"] = "gym"
     """Ant of ant_maze, ant_push and ant_fall: the one of ant, or HIRO's weaker one."""
     goal: Literal["fixed", "near", "uniform"] = "fixed"
-    """Goal of ant_maze: behind the walls, at the end of the first corridor, or drawn in each episode."""
+    """Goal of ant_maze: behind the walls, at the end of the first corridor, or drawn in each episode of training and
+    behind the walls in evaluation."""
     change_after: int = 0
     """Episodes of each environment after which the room of nav2d changes; 0 for never."""
 

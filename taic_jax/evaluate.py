@@ -65,6 +65,6 @@ def _run(
     keep: Callable[[State], Any],
 ) -> Rollout:
     key_start, key_rollout = jax.random.split(key)
-    env = AutoReset(env)
+    env = AutoReset(env.evaluated)
     running = start(env, agent.executor, num_envs, key_start)
     return rollout(env, agent.executor, agent.decide(exploration), running, key_rollout, ticks, keep)[1]

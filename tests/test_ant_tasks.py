@@ -166,6 +166,8 @@ def test_uniform_goals_fill_the_maze_and_are_observed():
     np.testing.assert_allclose(
         state.physics.closest, np.linalg.norm(goal - state.physics.qpos[:, :2], axis=1), rtol=1e-5
     )
+    evaluated = jax.jit(jax.vmap(task("ant_maze", goal="uniform")[0].evaluated.reset))
+    np.testing.assert_array_equal(evaluated(jax.random.split(jax.random.key(1), 3)).physics.goal, [(0, 16)] * 3)
 
 
 def test_near_goal_is_straight_ahead_and_the_fixed_one_behind_a_wall():

@@ -55,6 +55,17 @@ def test_counts_the_first_episode_of_each_environment_only():
     assert END < result["return"] <= result["length"] * (13 - result["length"]) / 2
 
 
+def test_runs_the_task_as_evaluation_sets_it():
+    class Drawn(Counting):
+        """Trained on longer episodes than those it is evaluated in."""
+
+        @property
+        def evaluated(self) -> Counting:
+            return Counting(END)
+
+    assert run(Drawn(END + 3))["return"] == run(Counting(END))["return"]
+
+
 def test_returns_are_sums_over_one_episode():
     """Without a spread every episode is 1 + ... + 6."""
     result = run(Counting(END))
