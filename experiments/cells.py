@@ -16,7 +16,6 @@ MILLION = 1_000_000
 FIRST_SEED = 200
 PATHS = "paths"
 """Method of the row that holds what options of the room draw."""
-RULES, DECODERS = ("fixed", "output", "predict"), ("open", "closed")
 
 # Found by `experiments.option_search`, whose log is results/option_search.csv. Steps and step size in closed loop are
 # of a sweep over 3 seeds of HalfCheetah.
@@ -64,14 +63,8 @@ METHODS = {
 SPACES = {"fixed-open-none": "RVAE", "output-open-both": "Term-output", "predict-open-both": "Term-predict"}
 FLAT = {"strong": "collect", "weak": "collect", "long": "collect", "repeat": "repeat"}
 """Methods without options, and the stage that trains each."""
-# Beside them, on HalfCheetah: every other kind of options, for the table of rules and for figure 6.
-OTHERS = {
-    f"{rule}-{decoder}-{constraints}": ("", 10)
-    for decoder in DECODERS
-    for constraints in ("both", "none")
-    for rule in RULES
-    if f"{rule}-{decoder}-{constraints}" not in METHODS
-}
+# Beside them, on HalfCheetah, for the table of options: every rule in closed loop, and what the constraints do there.
+OTHERS = dict.fromkeys(("output-closed-both", "predict-closed-both", "fixed-closed-none"), ("", 10))
 # Of figure 8: the method's name, and of figure 5c: the stage of the run that trains it.
 TRANSFERRED = {"open": ("options of Ant, open loop", "train"), "closed": ("options of Ant, closed loop", "train"),
                "tuned": ("options of Ant, fine-tuned", "train"), "flat": ("flat PPO", "flat"),
