@@ -14,8 +14,6 @@ RECOVERY = "nav2d"
 TICKS = {"ant": 2_000_000} | dict.fromkeys(TRANSFERS, 3_000_000)
 MILLION = 1_000_000
 FIRST_SEED = 200
-LOG_STD = -0.7
-"""Where the policy over options begins to explore, as long as D stays as it was learnt."""
 PATHS = "paths"
 """Method of the row that holds what options of the room draw."""
 
@@ -96,13 +94,7 @@ def flat_config(task: str, strength: str, seed: int, seeds: int) -> Config:
         config,
         collect=CollectConfig(ticks=2 * ticks if strength == "long" else ticks, capacity=MILLION, ppo=ppo),
         options=OptionsConfig(),  # what differs is told below; no preset may change it
-        train=dataclasses.replace(
-            config.train,
-            ticks=ticks,
-            baselines=(),
-            ppo=dataclasses.replace(config.train.ppo, log_std_init=LOG_STD),
-            fine_tune=FineTuneConfig(),
-        ),
+        train=dataclasses.replace(config.train, ticks=ticks, baselines=(), fine_tune=FineTuneConfig()),
         evaluate=EvaluateConfig(episodes=20, video_ticks=0),
         seed=seed,
         seeds=seeds,
@@ -122,10 +114,8 @@ def options_config(task: str, method: str, run_dir: Path, seed: int, seeds: int)
     changes: dict[str, Any] = {"termination": rule, "decoder": decoder} | SETTINGS[decoder] | CONSTRAINTS[constraints]
     changes |= EXCEPTIONS.get((task, decoder), {})
     changes |= VARIABLE[rule]
-    if tuned:  # as the preset is
-        preset = load_config(task).train
-        train = dataclasses.replace(config.train, ppo=preset.ppo, fine_tune=preset.fine_tune)
-        config = dataclasses.replace(config, train=train)
+    fine_tune = FineTuneConfig(epochs=10 if tuned else 0)
+    config = dataclasses.replace(config, train=dataclasses.replace(config.train, fine_tune=fine_tune))
     return with_options(config, config.options, experience=(str(source),), **changes)
 
 
