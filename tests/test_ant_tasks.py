@@ -166,7 +166,7 @@ def test_uniform_goals_fill_the_maze_and_are_observed():
     np.testing.assert_allclose(
         state.physics.closest, np.linalg.norm(goal - state.physics.qpos[:, :2], axis=1), rtol=1e-5
     )
-    evaluated = jax.jit(jax.vmap(task("ant_maze", goal="uniform")[0].evaluated.reset))
+    evaluated = jax.jit(jax.vmap(AutoReset(task("ant_maze", goal="uniform")[0]).evaluated.reset))
     np.testing.assert_array_equal(evaluated(jax.random.split(jax.random.key(1), 3)).physics.goal, [(0, 16)] * 3)
 
 
