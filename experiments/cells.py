@@ -114,7 +114,7 @@ def options_config(task: str, method: str, run_dir: Path, seed: int, seeds: int)
     changes: dict[str, Any] = {"termination": rule, "decoder": decoder} | SETTINGS[decoder] | CONSTRAINTS[constraints]
     changes |= EXCEPTIONS.get((task, decoder), {})
     changes |= VARIABLE[rule]
-    fine_tune = FineTuneConfig(epochs=10 if tuned else 0)
+    fine_tune = load_config(task).train.fine_tune if tuned else FineTuneConfig()
     config = dataclasses.replace(config, train=dataclasses.replace(config.train, fine_tune=fine_tune))
     return with_options(config, config.options, experience=(str(source),), **changes)
 
@@ -138,8 +138,13 @@ def robots(task: str, run_dir: Path, chunk: int = 10) -> list[Cell]:
 
 
 def transfers(task: str, run_dir: Path, seeds: int = 10) -> list[Cell]:
-    """Return the runs of figure 8 on one task; options and policy are of the ant's run `ant/source`."""
-    source = one_iteration(dataclasses.replace(load_config("ant"), seed=FIRST_SEED, seeds=seeds))
+    """Return the runs of figure 8 on one task; options and policy are of the ant's run `ant/source`.
+
+    That is as long as the ant's own runs: after half of it the ant walks too slowly to cross an arena in an episode.
+    """
+    ant = load_config("ant")
+    collect = dataclasses.replace(ant.collect, ticks=TICKS["ant"])
+    source = one_iteration(dataclasses.replace(ant, collect=collect, seed=FIRST_SEED, seeds=seeds))
     closed = dataclasses.replace(OptionsConfig(), decoder="closed", **SETTINGS["closed"] | EXCEPTIONS["ant", "closed"])
     opened = dataclasses.replace(OptionsConfig(), decoder="open", **SETTINGS["open"])
     folders = str(run_dir / "ant/source"), str(run_dir / "ant/source-open")
@@ -156,7 +161,7 @@ def transfers(task: str, run_dir: Path, seeds: int = 10) -> list[Cell]:
         seeds=seeds,
     )
     alone = dataclasses.replace(config, train=dataclasses.replace(config.train, baselines=()))
-    tuned = dataclasses.replace(alone, train=dataclasses.replace(alone.train, fine_tune=FineTuneConfig(epochs=10)))
+    tuned = dataclasses.replace(alone, train=dataclasses.replace(alone.train, fine_tune=ant.train.fine_tune))
     configs = {
         "closed": (with_options(config, closed, source=folders[0]), ("closed", "flat", "transfer")),
         "tuned": (with_options(tuned, closed, source=folders[0]), ("tuned",)),
