@@ -135,6 +135,9 @@ def main(args: Sequence[str] | None = None) -> None:
         if arguments.list:
             show(cells, planned, known, arguments)
             return
+        if not planned:
+            print("nothing to do: the table has every row that these runs give")
+            return
         keep_programs()
         shard = open_devices("auto", max((cell.config.seeds for cell in planned), default=0))
         for cell in planned:

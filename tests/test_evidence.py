@@ -154,7 +154,10 @@ def test_runs_are_done_once_and_taken_in_as_rows(monkeypatch, tmp_path, table, c
     told = json.loads((tmp_path / "flat/summary.json").read_text())["methods"]["collect"]
     np.testing.assert_allclose(strong["numbers"]["last"], told["return"]["per_seed"], rtol=1e-4)
     monkeypatch.setattr(evidence, "do", lambda *_: pytest.fail("it is in the table"))
+    monkeypatch.setattr(evidence, "open_devices", lambda *_: pytest.fail("nothing needs a device"))
+    capsys.readouterr()
     evidence.main(arguments)
+    assert capsys.readouterr().out == "nothing to do: the table has every row that these runs give\n"
     evidence.main([*arguments, "--list"])
     assert capsys.readouterr().out.count("in the table") == 2
     example = spaces.example_space(tmp_path / "options")
