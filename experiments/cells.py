@@ -115,7 +115,7 @@ def options_config(task: str, method: str, run_dir: Path, seed: int, seeds: int)
     changes |= EXCEPTIONS.get((task, decoder), {})
     changes |= VARIABLE[rule]
     fine_tune = load_config(task).train.fine_tune if tuned else FineTuneConfig()
-    config = dataclasses.replace(config, train=dataclasses.replace(config.train, fine_tune=fine_tune))
+    config = with_training(config, fine_tune=fine_tune)
     return with_options(config, config.options, experience=(str(source),), **changes)
 
 
@@ -154,37 +154,35 @@ def transfers(task: str, run_dir: Path, seeds: int = 10) -> list[Cell]:
     ]
     config = load_config(f"transfer_{task}")
     config = dataclasses.replace(
-        config,
-        train=dataclasses.replace(config.train, fine_tune=FineTuneConfig()),
+        with_training(config, baselines=(), fine_tune=FineTuneConfig()),
         evaluate=EvaluateConfig(episodes=20, video_ticks=0),
         seed=FIRST_SEED,
         seeds=seeds,
     )
-    alone = dataclasses.replace(config, train=dataclasses.replace(config.train, baselines=()))
-    tuned = dataclasses.replace(alone, train=dataclasses.replace(alone.train, fine_tune=ant.train.fine_tune))
     configs = {
-        "closed": (with_options(config, closed, source=folders[0]), ("closed", "flat", "transfer")),
-        "tuned": (with_options(tuned, closed, source=folders[0]), ("tuned",)),
-        "open": (with_options(alone, opened, source=folders[1]), ("open",)),
+        "tuned": with_options(with_training(config, fine_tune=ant.train.fine_tune), closed, source=folders[0]),
+        "flat": with_options(with_training(config, baselines=("flat",)), OptionsConfig()),
+        "transfer": with_options(with_training(config, baselines=("transfer",)), closed, source=folders[0]),
+        "open": with_options(config, opened, source=folders[1]),
+        "closed": with_options(config, closed, source=folders[0]),
     }
-    return sources + [
-        Cell(f"{task}/{name}", each, {method: TRANSFERRED[method][1] for method in methods}, "8")
-        for name, (each, methods) in configs.items()
-    ]
+    return sources + [Cell(f"{task}/{name}", each, {name: TRANSFERRED[name][1]}, "8") for name, each in configs.items()]
 
 
 def one_iteration(config: Config) -> Config:
     """Return the config of a run that nobody asks for its policy over options: of one iteration, and no baseline."""
     ppo = config.train.ppo
-    train = dataclasses.replace(
-        config.train, baselines=(), ticks=ppo.num_envs * ppo.rollout_length, fine_tune=FineTuneConfig()
-    )
-    return dataclasses.replace(config, train=train)
+    return with_training(config, baselines=(), ticks=ppo.num_envs * ppo.rollout_length, fine_tune=FineTuneConfig())
 
 
 def with_options(config: Config, options: OptionsConfig, **changes: Any) -> Config:
     """Return the config with these options, and these fields of them changed."""
     return dataclasses.replace(config, options=dataclasses.replace(options, **changes))
+
+
+def with_training(config: Config, **changes: Any) -> Config:
+    """Return the config with these fields of stage train changed."""
+    return dataclasses.replace(config, train=dataclasses.replace(config.train, **changes))
 
 
 def recovery(run_dir: Path, seeds: int = 50) -> list[Cell]:

@@ -28,7 +28,7 @@ from taic_jax.experiments.spaces import example_space, measure_spaces
 from taic_jax.experiments.table import TABLE, TableError, append_row, read_table, row_of
 from taic_jax.files import SaveError, save_text
 from taic_jax.logging import RunLogger
-from taic_jax.pipeline import collect, make_envs, run_pipeline, train_baseline
+from taic_jax.pipeline import collect, make_envs, run_pipeline, take_over, train_baseline
 from taic_jax.run_folder import RunFolderError, claimed, prepare_folder
 from taic_jax.stage import CLOCK, Clock, Run
 from taic_jax.summary import as_summary
@@ -61,7 +61,8 @@ def sources(cell: Cell, run_dir: Path) -> set[str]:
 
 
 def plan(cells: Sequence[Cell], only: tuple[str, ...], known: set[tuple[str, str, int]], run_dir: Path) -> list[Cell]:
-    """Return the runs to be done, and before them those that they take something from and that are not finished.
+    """Return the runs to be done, and before them those that they take something from, however far back, and that are
+    not finished.
 
     Raises:
         TableError: no run has such a name.
@@ -70,8 +71,10 @@ def plan(cells: Sequence[Cell], only: tuple[str, ...], known: set[tuple[str, str
     if unknown:
         raise TableError(f"--only: expected the start of a run's name, got {unknown[0]}; --list shows them")
     wanted = [cell for cell in cells if missing(cell, known) and (not only or cell.name.startswith(only))]
-    needed = set().union(*(sources(cell, run_dir) for cell in wanted))
-    names = {cell.name for cell in wanted} | {name for name in needed if not finished(run_dir / name)}
+    names = {cell.name for cell in wanted}
+    for cell in reversed(cells):  # those that others take something from stand before them
+        if cell.name in names:
+            names |= {name for name in sources(cell, run_dir) if not finished(run_dir / name)}
     return [cell for cell in cells if cell.name in names]
 
 
@@ -86,7 +89,7 @@ def do(cell: Cell, run_dir: Path, shard: Shard = "none") -> None:
     begun = (folder / "config.yaml").is_file()
     if finished(folder):
         prepare_folder(cell.config, folder, resume=True)  # only checks that it is this run
-    elif set(cell.stages.values()) <= {"collect", "repeat"} and cell.stages:
+    elif len(cell.stages) == 1 and not set(cell.stages.values()) & {"train", "options"}:
         (stage,) = cell.stages.values()
         run_flat(cell, folder, stage, make_devices(shard, cell.config), begun)
     else:
@@ -114,13 +117,14 @@ def run_flat(cell: Cell, folder: Path, stage: str, devices: Devices, resume: boo
     """Train flat PPO alone: `collect`, which keeps its experience, or a baseline."""
     config = cell.config
     env, source = make_envs(config)
+    _, policy = take_over(config, env, source)
     prepare_folder(config, folder, resume=resume)
     keys = jnp.stack([jax.random.key(config.seed + k) for k in range(config.seeds)])
     with claimed(folder), RunLogger(folder) as logger:
         clock = Clock.load(folder / CLOCK)
         run = Run(as_rows([config], config.seeds), keys, folder, logger, clock, devices=devices)
         logger.truncate("evaluate", -1)
-        trained = collect(run, source) if stage == "collect" else train_baseline(run, env, stage)
+        trained = collect(run, source) if stage == "collect" else train_baseline(run, env, stage, policy)
     summary = as_summary(run, {stage: {"first": trained.first, "last": trained.last}})
     save_text(folder / "summary.json", json.dumps(summary, indent=2) + "\n")
 

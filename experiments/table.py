@@ -109,7 +109,6 @@ def row_of(folder: Path, run_dir: Path, method: str, stage: str) -> dict[str, An
     fields = difference(config, run_dir)
     summary = json.loads((folder / "summary.json").read_text())
     told = summary["methods"]["taic" if stage == "train" else stage]
-    taken = "options.source" in fields or "options.experience" in fields or stage == "train"
     ticks = {"collect": config.collect.ticks, "total": config.collect.ticks + config.train.ticks}
     ticks = ticks.get(stage, config.train.ticks)
     grid = np.arange(1, GRID + 1) * (ticks // GRID)
@@ -124,7 +123,7 @@ def row_of(folder: Path, run_dir: Path, method: str, stage: str) -> dict[str, An
         "seed": config.seed,
         "seeds": config.seeds,
         "ticks": ticks,
-        "pretraining": config.collect.ticks if taken and stage in ("train", "transfer") else 0,
+        "pretraining": pretraining_of(config) if stage in ("train", "transfer") else 0,
         "config": config_hash(fields),
         "fields": fields,
         "versions": summary["versions"],
@@ -142,6 +141,12 @@ def row_of(folder: Path, run_dir: Path, method: str, stage: str) -> dict[str, An
             **numbers,
         },
     }
+
+
+def pretraining_of(config: Config) -> int:
+    """Return the interactions that were spent on what a run takes from others, or on its own experience."""
+    source = config.options.source or next(iter(config.options.experience), "")
+    return load_config(str(Path(source) / "config.yaml")).collect.ticks if source else config.collect.ticks
 
 
 def curves_of(rows: Sequence[dict[str, Any]], stage: str, grid: np.ndarray) -> dict[str, list]:

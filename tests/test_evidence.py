@@ -127,6 +127,8 @@ def test_what_is_in_the_table_is_not_done_again(tmp_path):
         assert evidence.sources(cell, tmp_path) <= {before.name for before in cells[:position]}
     names = [cell.name for cell in evidence.plan(cells, ("hopper/fixed-open-both",), set(), tmp_path)]
     assert names == ["hopper/strong", "hopper/fixed-open-both"], "and what it learns from is done before"
+    names = [cell.name for cell in evidence.plan(cells, ("ant_turn/open",), set(), tmp_path)]
+    assert names == ["ant/source", "ant/source-open", "ant_turn/open"], "and what that learns from before it"
     known = {("hopper", "fixed-open-both", 200)}
     assert evidence.plan(cells, ("hopper/fixed-open-both",), known, tmp_path) == []
     with pytest.raises(TableError, match="expected the start of a run's name, got hoper"):
@@ -166,6 +168,28 @@ def test_runs_are_done_once_and_taken_in_as_rows(monkeypatch, tmp_path, table, c
     assert np.isfinite(ends).all() and (ends.std(axis=0) > 0).all(), "options lead from one state to several"
     evidence_row = row_of(tmp_path / "flat", tmp_path, "strong", "collect")
     assert evidence_row["config"] == strong["config"]
+
+
+def test_flat_ppo_from_another_runs_policy_is_a_run_of_its_own(monkeypatch, tmp_path, table):
+    """It starts where the source's policy ended, and counts the interactions of that."""
+    source = with_fields(CONFIG, collect__env="", options__experience=(), evaluate__video_ticks=0)
+    apart = with_fields(source, collect__ticks=16, options__source=str(tmp_path / "source"))
+    cells = [Cell("source", source, {}, "8")]
+    for stage in ("flat", "transfer"):
+        config = with_fields(apart, train__baselines=(stage,))
+        cells.append(Cell(f"nav2d/{stage}", config, {stage: stage}, "8"))
+    monkeypatch.setattr(evidence, "all_cells", lambda run_dir: cells)
+    started = []
+    train_baseline = evidence.train_baseline
+    monkeypatch.setattr(
+        evidence, "train_baseline", lambda *args: (started.append(args[3] is not None), train_baseline(*args))[1]
+    )
+    with tiny_steps():
+        evidence.main(["--run-dir", str(tmp_path), "--table", str(table)])
+    flat, transfer = read_table(table)
+    assert (flat["method"], flat["pretraining"], transfer["method"]) == ("flat", 0, "transfer")
+    assert transfer["pretraining"] == source.collect.ticks, "and not those of its own config"
+    assert started == [False, True]
 
 
 def test_figure_7_marks_what_is_missing(table, tmp_path, monkeypatch):
