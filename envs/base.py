@@ -8,6 +8,8 @@ from flax import struct
 from jax import Array
 from jaxtyping import Float, Key
 
+from taic_jax.envs.views import Views, one_view
+
 
 class PhysicsState(struct.PyTreeNode):
     """The whole memory of a MuJoCo simulation between two ticks."""
@@ -42,6 +44,11 @@ class Env(abc.ABC):
     proprioception: str  # name of that slice; may be missing: then it is the task's own, and no other task shares it
     episode_length: int  # ticks
     dt: float  # seconds a tick
+
+    @property
+    def views(self) -> Views:
+        """Ways to see the same motion of the body: one, unless it is symmetric."""
+        return one_view(self.proprioceptive_size, self.action_size)
 
     @property
     def evaluated(self) -> "Env":

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Key
 from taic_jax.envs.base import Env, PhysicsState, State
 from taic_jax.envs.physics import make_physics
 from taic_jax.envs.robots import Robot, compile_spec, initial_qpos, load_spec
+from taic_jax.envs.views import Views, make_views
 
 
 class Locomotion(Env):
@@ -48,6 +49,12 @@ class Locomotion(Env):
         state = jax.eval_shape(self.reset, jax.random.key(0))
         self.observation_size = self.proprioceptive_size = state.obs.shape[0]
         self.proprioception = name
+
+    @property
+    def views(self) -> Views:
+        """Views of the robot from each of its equal sides."""
+        robot = self.robot
+        return make_views(robot.turned_obs, robot.turned_action, robot.sides) if robot.sides > 1 else super().views
 
     def reset(self, key: Key[Array, ""]) -> State:
         """Start near the initial pose, with Gym's noise."""

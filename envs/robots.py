@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from taic_jax.envs.errors import MissingExtraError
+from taic_jax.envs.views import Signed
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,6 +35,10 @@ class Robot:
     # MJX's solver and line search; None for the model's own. `experiments.worlds --solver` measures them.
     iterations: int | None = None
     ls_iterations: int | None = 4
+    # How obs and action look from the next of `sides` equal sides of the body (see `views`).
+    sides: int = 1
+    turned_obs: Signed = ()
+    turned_action: Signed = ()
 
 
 def _brax(name: str) -> tuple[str, str]:
@@ -47,6 +52,17 @@ def _gym(name: str) -> tuple[str, str]:
 _HALF_CHEETAH = Robot(
     _brax("half_cheetah"), num_unobserved=1, control_cost=0.1, reset_noise=0.1, velocity_noise="normal"
 )
+# A quarter turn to the left: each leg does what the one to its right did. The ankles' axes point outwards on two
+# opposite legs and inwards on the others, so that their angles change sign from leg to leg.
+_TURNED_VECTOR: Signed = ((1, -1), (0, 1), (2, 1))  # x' = -y, y' = x, z' = z
+_TURNED_LEGS: Signed = ((6, 1), (7, 1), (0, 1), (1, -1), (2, 1), (3, 1), (4, 1), (5, -1))  # hip and ankle, 1 to 4
+_TURNED_MOTORS: Signed = ((6, 1), (7, -1), (0, 1), (1, 1), (2, 1), (3, -1), (4, 1), (5, 1))  # of legs 4, 1, 2, 3
+
+
+def _behind(first: int, turned: Signed) -> Signed:
+    return tuple((first + index, sign) for index, sign in turned)
+
+
 _ANT = Robot(
     _brax("ant"),
     num_unobserved=2,
@@ -56,6 +72,13 @@ _ANT = Robot(
     healthy_reward=1.0,
     healthy_height=(0.2, 1.0),
     height_index=2,
+    sides=4,
+    # Height, quaternion, joints; then the speeds of torso and joints.
+    turned_obs=(
+        *((0, 1), (1, 1), *_behind(2, _TURNED_VECTOR), *_behind(5, _TURNED_LEGS)),
+        *(*_behind(13, _TURNED_VECTOR), *_behind(16, _TURNED_VECTOR), *_behind(19, _TURNED_LEGS)),
+    ),
+    turned_action=_TURNED_MOTORS,
 )
 # Brax moved the root joints of hopper and walker2d into the torso, where its height of 1.25 m reads 0.
 _HOPPER = Robot(

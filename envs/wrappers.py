@@ -9,6 +9,7 @@ from jax import Array
 from jaxtyping import Float, Key
 
 from taic_jax.envs.base import Env, State
+from taic_jax.envs.views import Views
 
 
 class Wrapper(Env):
@@ -21,6 +22,11 @@ class Wrapper(Env):
         if name == "env":  # not yet set, as while unpickling
             raise AttributeError(name)
         return getattr(self.env, name)
+
+    @property
+    def views(self) -> Views:
+        """Those of the inner environment's body."""
+        return self.env.views
 
     @property
     def evaluated(self) -> Env:

@@ -28,10 +28,11 @@ from taic_jax.experiments.spaces import example_space, measure_spaces
 from taic_jax.experiments.table import TABLE, TableError, append_row, read_table, row_of
 from taic_jax.files import SaveError, save_text
 from taic_jax.logging import RunLogger
-from taic_jax.pipeline import collect, make_envs, run_pipeline, take_over, train_baseline
+from taic_jax.pipeline import collect, run_pipeline, take_over, train_baseline
 from taic_jax.run_folder import RunFolderError, claimed, prepare_folder
 from taic_jax.stage import CLOCK, Clock, Run
 from taic_jax.summary import as_summary
+from taic_jax.tasks import make_envs
 from taic_jax.types import as_rows
 
 

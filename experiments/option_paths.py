@@ -20,7 +20,7 @@ from taic_jax.experience import EXPERIENCE, read_experience
 from taic_jax.networks import apply
 from taic_jax.options.dataset import gather, make_dataset
 from taic_jax.options.model import OptionModel, make_networks
-from taic_jax.pipeline import make_envs
+from taic_jax.tasks import make_envs
 from taic_jax.types import as_arrays
 
 STEPS = 11

@@ -28,10 +28,10 @@ from taic_jax.experience import gather_experience
 from taic_jax.options.dataset import Experience
 from taic_jax.options.execution import make_executor
 from taic_jax.options.learning import learn
-from taic_jax.pipeline import make_envs
 from taic_jax.rl import ppo
 from taic_jax.summary import commit
 from taic_jax.sweep.axes import configs_of, grid, is_leaf, parse_axis, replace
+from taic_jax.tasks import make_envs
 from taic_jax.types import as_arrays
 from taic_jax.validation import validate
 
@@ -59,7 +59,7 @@ class Arguments:
 def score(env: Env, config: Config, experience: Experience, key: jax.Array) -> dict[str, jax.Array]:
     """Learn options, train over them, and return what came out, of one point and seed."""
     key_learn, key_train, key_evaluate = jax.random.split(key, 3)
-    model, losses = learn(config.options, experience, key_learn)
+    model, losses = learn(config.options, experience, key_learn, env.views)
     executor = make_executor(config.options, env.action_size, model)
     first = ppo.as_agent(config.train.ppo, executor, ppo.init(config.train.ppo, env, executor, key_train))
     agent, metrics = ppo.train(config.train.ppo, env, executor, key_train, config.train.ticks)

@@ -153,6 +153,11 @@ class OptionsConfig:
     """Which of these windows to learn from: all, or those that collected most reward."""
     fraction: float = 0.5
     """Share of the windows that select top keeps."""
+    views: Literal["one", "all"] = "one"
+    """See each window as it was, or as from any of the body's equal sides: the ant has four."""
+    state_noise: float = 0.0
+    """Standard deviation of noise on the state that a closed-loop D learns from, so that it heeds the code; where each
+    entry of the state has unit variance."""
 
 
 @dataclass(frozen=True)

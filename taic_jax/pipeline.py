@@ -1,6 +1,5 @@
 """The main job: collect experience, learn options, train a policy over them, evaluate."""
 
-import dataclasses
 import json
 import sys
 from collections.abc import Callable, Sequence
@@ -15,9 +14,8 @@ import numpy as np
 from taic_jax.artifacts import OPTIONS, POLICY, describe, load_options, load_policy, save_options, save_policy
 from taic_jax.config import COLLECT, Config, ConfigError, OptionsConfig, Shard, collector_is_baseline, needs_collect
 from taic_jax.devices import make_devices
-from taic_jax.envs import environment_options, make_env
 from taic_jax.envs.base import Env
-from taic_jax.envs.errors import RenderingError, UnknownNameError
+from taic_jax.envs.errors import RenderingError
 from taic_jax.experience import EXPERIENCE, ExperienceStore, gather_experience, num_blocks
 from taic_jax.files import save_text
 from taic_jax.guard import FINITE
@@ -32,6 +30,7 @@ from taic_jax.options.model import Networks, OptionModel, make_networks
 from taic_jax.run_folder import claimed, log_folder, prepare_folder
 from taic_jax.stage import CLOCK, Clock, Run, drive
 from taic_jax.summary import as_summary, write_video
+from taic_jax.tasks import make_envs
 from taic_jax.types import as_rows
 
 STEPS_PER_LOG = 100
@@ -91,41 +90,6 @@ def run_pipeline(
     except RenderingError as error:  # nothing else depends on it, and all results are saved
         print(f"taic_jax: no video: {error}", file=sys.stderr)
     return summary
-
-
-def make_envs(config: Config) -> tuple[Env, Env]:
-    """Return the task and the environment that experience is collected in.
-
-    Raises:
-      ConfigError: there is no such environment, or options learnt in one do not fit the other.
-    """
-    options = dataclasses.asdict(config.env)
-    field, name = "env.name", options.pop("name")
-    try:
-        env = source = make_env(name, **options)
-        if config.collect.env:
-            field, name = "collect.env", config.collect.env
-            kept = ("backend", "num_threads", *environment_options(name))
-            source = make_env(name, **{option: options[option] for option in kept})
-    except UnknownNameError as error:
-        raise ConfigError(f"{field}: {error}") from None
-    bodies = [(*describe(e).values(),)[1:] for e in (source, env)]
-    if bodies[0] != bodies[1]:
-        raise ConfigError(
-            f"collect.env: expected the body of {config.env.name} (proprioceptive slice, its size, and action size "
-            f"{bodies[1]}), got {config.collect.env} with {bodies[0]}"
-        )
-    if config.train.ppo.reset_at_change and "changed" not in jax.eval_shape(env.reset, jax.random.key(0)).metrics:
-        raise ConfigError(
-            f"train.ppo.reset_at_change: expected a task that changes, as nav2d does with env.change_after, "
-            f"got {config.env.name}, which never does; the nearest valid value is False"
-        )
-    if config.options.length > env.episode_length:
-        raise ConfigError(
-            f"options.length: expected at most the {env.episode_length} ticks of an episode of {env.name}, "
-            f"got {config.options.length}; the nearest valid value is {env.episode_length}"
-        )
-    return env, source
 
 
 def take_over(
@@ -270,7 +234,7 @@ def select_windows(run: Run, env: Env) -> Dataset:
         for name in names
     ]
     given = run.devices.place((sources, config))
-    dataset = run.rows(run.compile(jax.vmap(make_dataset), *given)(*given))
+    dataset = run.rows(run.compile(jax.vmap(partial(make_dataset, views=env.views)), *given)(*given))
     span = f"in {', '.join(names)} between its shares {jnp.min(config.since):g} and {jnp.max(config.until):g}"
     if not dataset.count.all():
         raise ConfigError(

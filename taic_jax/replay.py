@@ -15,8 +15,9 @@ from taic_jax.envs.base import Env
 from taic_jax.guard import FINITE, QUANTITIES
 from taic_jax.logging import RunLogger
 from taic_jax.options.model import make_networks
-from taic_jax.pipeline import learn_over_rows, make_envs, over_rows, select_windows, step_over_rows
+from taic_jax.pipeline import learn_over_rows, over_rows, select_windows, step_over_rows
 from taic_jax.stage import Clock, Run
+from taic_jax.tasks import make_envs
 from taic_jax.types import as_arrays, as_rows
 
 FIELDS = ("stage", "seed", "seeds", "step", "after", "quantity")

@@ -75,8 +75,9 @@ def execute(command: Command) -> int:
     from taic_jax.compilation import keep_programs
     from taic_jax.devices import open_devices
     from taic_jax.hosts import Hosts
-    from taic_jax.pipeline import make_envs, run_pipeline
+    from taic_jax.pipeline import run_pipeline
     from taic_jax.summary import plan
+    from taic_jax.tasks import make_envs
 
     if command.dry_run:
         print(to_yaml(command.config))

@@ -23,7 +23,7 @@ LAYERS = (
     "rl",
     "experience evaluate statistics artifacts demonstrations measures option_space",
     "logging interruption level population",
-    "stage summary",
+    "stage summary tasks",
     "pipeline",
     "replay command_line",
     "run sweep",

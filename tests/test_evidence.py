@@ -174,22 +174,17 @@ def test_flat_ppo_from_another_runs_policy_is_a_run_of_its_own(monkeypatch, tmp_
     """It starts where the source's policy ended, and counts the interactions of that."""
     source = with_fields(CONFIG, collect__env="", options__experience=(), evaluate__video_ticks=0)
     apart = with_fields(source, collect__ticks=16, options__source=str(tmp_path / "source"))
-    cells = [Cell("source", source, {}, "8")]
-    for stage in ("flat", "transfer"):
-        config = with_fields(apart, train__baselines=(stage,))
-        cells.append(Cell(f"nav2d/{stage}", config, {stage: stage}, "8"))
+    configs = {stage: with_fields(apart, train__baselines=(stage,)) for stage in ("flat", "transfer")}
+    cells = [Cell("source", source, {}, "8"), *(Cell(f"nav2d/{s}", c, {s: s}, "8") for s, c in configs.items())]
     monkeypatch.setattr(evidence, "all_cells", lambda run_dir: cells)
-    started = []
-    train_baseline = evidence.train_baseline
-    monkeypatch.setattr(
-        evidence, "train_baseline", lambda *args: (started.append(args[3] is not None), train_baseline(*args))[1]
-    )
+    begun, train = [], evidence.train_baseline
+    monkeypatch.setattr(evidence, "train_baseline", lambda *x: (begun.append(x[3] is not None), train(*x))[1])
     with tiny_steps():
         evidence.main(["--run-dir", str(tmp_path), "--table", str(table)])
     flat, transfer = read_table(table)
     assert (flat["method"], flat["pretraining"], transfer["method"]) == ("flat", 0, "transfer")
     assert transfer["pretraining"] == source.collect.ticks, "and not those of its own config"
-    assert started == [False, True]
+    assert begun == [False, True]
 
 
 def test_figure_7_marks_what_is_missing(table, tmp_path, monkeypatch):

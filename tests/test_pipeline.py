@@ -30,8 +30,9 @@ from taic_jax.envs import make_env
 from taic_jax.experience import ExperienceStore, read_experience
 from taic_jax.logging import RunLogger
 from taic_jax.options.dataset import Experience
-from taic_jax.pipeline import make_envs, over_rows, run_pipeline
+from taic_jax.pipeline import over_rows, run_pipeline
 from taic_jax.run_folder import RunFolderError
+from taic_jax.tasks import make_envs
 from taic_jax.types import as_rows
 
 STAGES = {"collect": 3, "learn": 2, "train": 3}

@@ -9,6 +9,7 @@ from flax import struct
 from jaxtyping import Array, Float, Int
 
 from taic_jax.config import OptionsConfig
+from taic_jax.envs.views import Views, one_view
 from taic_jax.options.model import Scale
 
 # Every tenth stretch of experience is held out where P's error on unseen windows is needed. A stretch is
@@ -50,6 +51,7 @@ class Dataset(struct.PyTreeNode):
     held_out: Array
     state_scale: Scale
     change_scale: Scale
+    views: Views
 
 
 def window_score(reward: Float[Array, "T B"], done: Array, length: int) -> tuple[Float[Array, "T B"], Array]:
@@ -65,7 +67,9 @@ def window_score(reward: Float[Array, "T B"], done: Array, length: int) -> tuple
     return total, ~crosses & inside[:, None]
 
 
-def make_dataset(experience: Experience | Sequence[Experience], config: OptionsConfig) -> Dataset:
+def make_dataset(
+    experience: Experience | Sequence[Experience], config: OptionsConfig, views: Views | None = None
+) -> Dataset:
     """Select windows of `config.length` ticks and measure the scales over them.
 
     Windows start between the shares `since` and `until` of each experience, a span that is cut into `parts`. Of each
@@ -73,7 +77,8 @@ def make_dataset(experience: Experience | Sequence[Experience], config: OptionsC
 
     Args:
       experience: one, or several of the same body; selected from each by itself, then merged.
-      config: how to select.
+      config: how to select, and whether all views of the body are learnt from.
+      views: of the body; by default it has one.
 
     Raises:
       ShortExperienceError: windows are to be held out, and none of the experiences is long enough.
@@ -95,9 +100,13 @@ def make_dataset(experience: Experience | Sequence[Experience], config: OptionsC
     count, held = jnp.sum(group == 0, dtype=jnp.int32), jnp.sum(group == 1, dtype=jnp.int32)
     rows: Any = jax.tree.map(lambda *x: jnp.concatenate([_flatten(y) for y in x]), *sources)
     probe = starts[(jnp.arange(100_000.0) * (count.astype(jnp.float32) / 1e5)).astype(jnp.int32)]
-    state = rows.obs[probe]
-    change = rows.obs[probe + config.length] - state
-    return Dataset(rows, starts, count, held, _scale(state), _scale(change))
+    if views is None or config.views == "one":
+        views = one_view(rows.obs.shape[-1], rows.action.shape[-1])
+    seen = jax.vmap(views.obs, (0, None))(
+        jnp.arange(len(views)), jnp.stack([rows.obs[probe], rows.obs[probe + config.length]])
+    )
+    state, end = jnp.swapaxes(seen, 0, 1).reshape((2, -1, seen.shape[-1]))
+    return Dataset(rows, starts, count, held, _scale(state), _scale(end - state), views)
 
 
 def holds_out(config: OptionsConfig) -> bool:
@@ -146,8 +155,20 @@ def _scale(x: Float[Array, "N P"]) -> Scale:
     return Scale(jnp.mean(x, axis=0), jnp.where(std < 1e-4, 1.0, std))
 
 
-def gather(dataset: Dataset, which: Int[Array, " N"], ticks: Int[Array, " N"], length: int) -> Window:
-    """Return the windows at positions `which` of `starts`, of `ticks` <= `length` ticks each; leading axis N."""
+def gather(
+    dataset: Dataset,
+    which: Int[Array, " N"],
+    ticks: Int[Array, " N"],
+    length: int,
+    view: Int[Array, " N"] | None = None,
+) -> Window:
+    """Return the windows at positions `which` of `starts`, of `ticks` <= `length` ticks each; leading axis N.
+
+    Each is seen in its `view`, by default as it was.
+    """
     rows = dataset.starts[which][:, None] + jnp.arange(length + 1)[None]
     mask = jnp.arange(length)[None] < ticks[:, None]
-    return Window(dataset.experience.obs[rows], dataset.experience.action[rows[:, :-1]], mask)
+    states, actions = dataset.experience.obs[rows], dataset.experience.action[rows[:, :-1]]
+    if view is not None:
+        states, actions = jax.vmap(dataset.views.obs)(view, states), jax.vmap(dataset.views.action)(view, actions)
+    return Window(states, actions, mask)

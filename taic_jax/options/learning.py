@@ -11,6 +11,7 @@ from flax import struct
 from jaxtyping import Array, Float, Int, Key
 
 from taic_jax.config import OptionsConfig
+from taic_jax.envs.views import Views
 from taic_jax.guard import earliest, first_nonfinite
 from taic_jax.networks import apply
 from taic_jax.options.dataset import Dataset, Experience, Window, gather, make_dataset
@@ -54,9 +55,17 @@ def init(config: OptionsConfig, networks: Networks, key: Key[Array, ""]) -> Lear
 
 
 def window_losses(
-    params: dict, networks: Networks, model: OptionModel, config: OptionsConfig, window: Window, noise: Array
+    params: dict,
+    networks: Networks,
+    model: OptionModel,
+    config: OptionsConfig,
+    window: Window,
+    noise: Array,
+    disturbance: Array | float = 0.0,
 ) -> dict[str, Array]:
     """Return the losses of one window and its duration, `noise` [D] drawing every o_i from q(o|a_0..a_i).
+
+    The normalised states that D is told are off by `disturbance` [L, P].
 
     The sum E descends is L_recons + lambda_kl L_KL + lambda_pred L_pred - lambda_adv L_adv (and, where D emits an
     end signal, lambda_end times its loss), and F descends L_adv: the reversal in front of F changes the sign on its
@@ -78,7 +87,7 @@ def window_losses(
     if config.termination != "predict":
         reached = jnp.stack([window.states[0], window.states[last + 1]])
         prediction = prefix_errors(networks, model, option[None], reached)[0]
-    decoded, end_logit = apply(networks.decoder, params["decoder"], option, states[:-1])
+    decoded, end_logit = apply(networks.decoder, params["decoder"], option, states[:-1] + disturbance)
     estimated = apply(networks.estimator, params["estimator"], gradient_reversal(option, config.lambda_adv))
     losses = {
         "reconstruction_loss": reconstruction_loss(decoded, window.actions, mask),
@@ -91,11 +100,11 @@ def window_losses(
 
 
 def total_loss(
-    params: dict, networks: Networks, model: OptionModel, config: OptionsConfig, windows: Window, noise: Array
+    params: dict, networks: Networks, model: OptionModel, config: OptionsConfig, windows: Window, *noise: Array
 ) -> tuple[Float[Array, ""], dict[str, Array]]:
-    """Return the weighted sum over N windows and the mean of each loss."""
+    """Return the weighted sum over N windows and the mean of each loss; `noise` is the codes', then the states'."""
     one = partial(window_losses, params, networks, model, config)
-    losses = jax.tree.map(jnp.mean, jax.vmap(one)(windows, noise))
+    losses = jax.tree.map(jnp.mean, jax.vmap(one)(windows, *noise))
     total = (
         losses["reconstruction_loss"]
         + config.lambda_kl * losses["kl_loss"]
@@ -114,9 +123,12 @@ def step(
     if config.termination == "predict" and config.delta_unit == "quantile":
         state = state.replace(delta=_measure_delta(config, networks, dataset, state, key_delta))
     windows = _draw(config, dataset, key_windows, jnp.zeros((), jnp.int32), dataset.count)
-    noise = jax.random.normal(key_option, (config.batch_size, config.size))
+    noise = [jax.random.normal(key_option, (config.batch_size, config.size))]
+    if config.decoder == "closed":
+        key_states = jax.random.fold_in(key_option, 1)  # what else is drawn stays as it was before there was this noise
+        noise.append(config.state_noise * jax.random.normal(key_states, windows.states[:, :-1].shape))
     model = as_model(state, dataset)
-    gradient, losses = jax.grad(total_loss, has_aux=True)(state.params, networks, model, config, windows, noise)
+    gradient, losses = jax.grad(total_loss, has_aux=True)(state.params, networks, model, config, windows, *noise)
     with jax.numpy_dtype_promotion("standard"):  # Optax raises a float to an integer power
         updates, optimizer = make_optimizer(config).update(gradient, state.optimizer)
     params: Any = optax.apply_updates(state.params, updates)
@@ -137,7 +149,10 @@ def _draw(
     which = first + jax.random.randint(key_which, (config.batch_size,), 0, count)
     shortest = config.shortest if config.termination == "output" else config.length
     ticks = jax.random.randint(key_ticks, (config.batch_size,), shortest, config.length + 1)
-    return gather(dataset, which, ticks, config.length)
+    view = None
+    if len(dataset.views) > 1:
+        view = jax.random.randint(jax.random.fold_in(key_which, 1), (config.batch_size,), 0, len(dataset.views))
+    return gather(dataset, which, ticks, config.length, view)
 
 
 def _measure_delta(
@@ -171,18 +186,21 @@ def as_model(state: LearnState, dataset: Dataset) -> OptionModel:
 
 
 def learn(
-    config: OptionsConfig, experience: Experience | Sequence[Experience], key: Key[Array, ""]
+    config: OptionsConfig,
+    experience: Experience | Sequence[Experience],
+    key: Key[Array, ""],
+    views: Views | None = None,
 ) -> tuple[OptionModel, dict[str, Array]]:
     """Learn an option model from experience [T, B, ...]; pure, so experiences and keys may be vmapped.
 
     Several experiences, of tasks that share the body, are merged. Returns the model and the losses of every step,
-    leading axis the step.
+    leading axis the step. Where `config.views` is all, windows are seen in all `views` of the body (`Env.views`).
 
     Raises:
       ShortExperienceError: delta is a quantile, and there is no experience long enough to hold a part of it out.
     """
     config = as_arrays(config)
-    dataset = make_dataset(experience, config)
+    dataset = make_dataset(experience, config, views)
     rows = dataset.experience
     networks = make_networks(config, rows.obs.shape[-1], rows.action.shape[-1])
     state = init(config, networks, key)

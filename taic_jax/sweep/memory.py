@@ -12,7 +12,8 @@ import jax.numpy as jnp
 from taic_jax.config import Config, ConfigError, needs_collect
 from taic_jax.experience import experience_bytes, num_blocks
 from taic_jax.options.dataset import Experience, make_dataset
-from taic_jax.pipeline import make_envs, over_rows
+from taic_jax.pipeline import over_rows
+from taic_jax.tasks import make_envs
 from taic_jax.types import as_rows
 
 MIB = 2**20

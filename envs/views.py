@@ -1,0 +1,53 @@
+"""Views of a symmetric body: the same motion, told as another of its sides would see it."""
+
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array
+from jaxtyping import Float, Int
+
+
+class Views(struct.PyTreeNode):
+    """V views, each a signed permutation of the proprioceptive slice [P] and of the action [A].
+
+    The first changes nothing. What is possible in one view is possible in all of them: a simulation commutes with them.
+    """
+
+    obs_order: Array  # [V, P]
+    obs_sign: Array
+    action_order: Array  # [V, A]
+    action_sign: Array
+
+    def __len__(self) -> int:
+        """V."""
+        return self.obs_order.shape[-2]
+
+    def obs(self, view: Int[Array, ""], obs: Float[Array, "*batch P"]) -> Float[Array, "*batch P"]:
+        """Return proprioceptive slices as seen in a view."""
+        return obs[..., self.obs_order[view]] * jnp.broadcast_to(self.obs_sign[view], obs.shape)
+
+    def action(self, view: Int[Array, ""], action: Float[Array, "*batch A"]) -> Float[Array, "*batch A"]:
+        """Return actions as seen in a view."""
+        return action[..., self.action_order[view]] * jnp.broadcast_to(self.action_sign[view], action.shape)
+
+
+Signed = tuple[tuple[int, int], ...]
+"""For each entry the index of the one that takes its place, and its sign."""
+
+
+def one_view(obs_size: int, action_size: int) -> Views:
+    """Return the view of a body that looks different from every side."""
+    return make_views(tuple((i, 1) for i in range(obs_size)), tuple((i, 1) for i in range(action_size)), 1)
+
+
+def make_views(obs: Signed, action: Signed, count: int) -> Views:
+    """Return `count` views, each a turn further than the one before."""
+    arrays = []
+    for turn in (obs, action):
+        order, sign = (np.array(column) for column in zip(*turn, strict=True))
+        orders, signs = [np.arange(len(order))], [np.ones(len(order))]
+        for _ in range(count - 1):
+            orders.append(orders[-1][order])
+            signs.append(sign * signs[-1][order])
+        arrays += [jnp.array(np.stack(orders), jnp.int32), jnp.array(np.stack(signs), jnp.float32)]
+    return Views(*arrays)
