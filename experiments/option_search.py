@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
+from taic_jax import option_space
 from taic_jax.config import Config, ConfigError, walk
 from taic_jax.config_io import load_config
 from taic_jax.envs.base import Env
@@ -28,6 +29,7 @@ from taic_jax.experience import gather_experience
 from taic_jax.options.dataset import Experience
 from taic_jax.options.execution import make_executor
 from taic_jax.options.learning import learn
+from taic_jax.options.model import OptionModel
 from taic_jax.rl import ppo
 from taic_jax.summary import commit
 from taic_jax.sweep.axes import configs_of, grid, is_leaf, parse_axis, replace
@@ -37,7 +39,7 @@ from taic_jax.validation import validate
 
 FIELDS = (
     "task", "point", "seeds", "ticks", "untrained", "return", "mean_option", "duration", "kl_loss",
-    "reconstruction_loss", "prediction_loss", "seconds", "commit",
+    "reconstruction_loss", "prediction_loss", "distance_correlation", "seconds", "commit",
 )  # fmt: skip
 
 
@@ -56,15 +58,15 @@ class Arguments:
     config: Annotated[Config, tyro.conf.arg(name=""), tyro.conf.FlagConversionOff] = Config()
 
 
-def score(env: Env, config: Config, experience: Experience, key: jax.Array) -> dict[str, jax.Array]:
-    """Learn options, train over them, and return what came out, of one point and seed."""
+def score(env: Env, config: Config, experience: Experience, key: jax.Array) -> tuple[OptionModel, dict[str, jax.Array]]:
+    """Learn options, train over them, and return them and what came out, of one point and seed."""
     key_learn, key_train, key_evaluate = jax.random.split(key, 3)
     model, losses = learn(config.options, experience, key_learn, env.views)
     executor = make_executor(config.options, env.action_size, model)
     first = ppo.as_agent(config.train.ppo, executor, ppo.init(config.train.ppo, env, executor, key_train))
     agent, metrics = ppo.train(config.train.ppo, env, executor, key_train, config.train.ticks)
     told = partial(evaluate, env, key=key_evaluate, episodes=config.evaluate.episodes)
-    return {
+    return model, {
         "untrained": told(first)["return"],
         "return": told(agent)["return"],
         "mean_option": told(agent, exploration=0.0)["return"],
@@ -94,7 +96,7 @@ def search(arguments: Arguments, config: Config) -> list[dict[str, Any]]:
     keys = jnp.stack([jax.random.key(config.seed + k) for k in range(config.seeds)])
     over_seeds = jax.vmap(partial(score, env), in_axes=(None, 0, 0))
     over_points = jax.vmap(over_seeds, in_axes=(axes, None, None)) if points[0] else over_seeds
-    scores = jax.device_get(jax.jit(over_points)(swept, experience, keys))
+    models, scores = jax.device_get(jax.jit(over_points)(swept, experience, keys))
     seconds = round(time.time() - started)
     rows = []
     for i, point in enumerate(points):
@@ -103,8 +105,13 @@ def search(arguments: Arguments, config: Config) -> list[dict[str, Any]]:
             "task": config.env.name, "point": " ".join(f"{k}={v}" for k, v in settings.items()),
             "seeds": config.seeds, "ticks": config.train.ticks, "seconds": seconds, "commit": commit(),
         }  # fmt: skip
-        for name, values in scores.items():
-            row[name] = " ".join(f"{x:.4g}" for x in np.atleast_1d(values[i] if points[0] else values))
+        told, learnt = jax.tree.map(lambda x, i=i: x[i], (scores, models)) if points[0] else (scores, models)
+        told["distance_correlation"] = [
+            option_space.order(env, config.options, jax.tree.map(lambda x, k=k: x[k], learnt), key)
+            for k, key in enumerate(keys)
+        ]
+        for name, values in told.items():
+            row[name] = " ".join(f"{x:.4g}" for x in values)
         rows.append(row)
     return rows
 
@@ -131,7 +138,7 @@ def main(args: Sequence[str] | None = None) -> None:
             writer.writeheader()
         writer.writerows(rows)
     for row in rows:
-        numbers = {name: np.mean(np.array(row[name].split(), float)) for name in FIELDS[4:11]}
+        numbers = {name: np.mean(np.array(row[name].split(), float)) for name in FIELDS[4:12]}
         print(row["point"], "|", ", ".join(f"{name} {value:.4g}" for name, value in numbers.items()))
 
 

@@ -46,7 +46,7 @@ def measure_option_space(option: ArrayLike, start: ArrayLike, end: ArrayLike, se
     end = _finite_rows(end, "end")
     if start.shape != end.shape:
         raise ValueError(f"start has shape {start.shape}, end has {end.shape}")
-    change, start, end = (_standardized(y, y) for y in (end - start, start, end))
+    change, start, end = (standardized(y, y) for y in (end - start, start, end))
     targets = {"change": change, "start": start, "end": end}
     mean, upper = permutation_baseline(option, change, seed=seed, components=COMPONENTS)
     return {
@@ -213,7 +213,7 @@ def _pair(x: ArrayLike, y: ArrayLike, x_name: str = "x", y_name: str = "y") -> t
     return x, y
 
 
-def _standardized(values: np.ndarray, reference: np.ndarray) -> np.ndarray:
+def standardized(values: np.ndarray, reference: np.ndarray) -> np.ndarray:
     """Return values scaled to mean 0 and standard deviation 1 on the reference's rows; constant columns become 0."""
     std = reference.std(axis=0)
     # Float32 leaves its rounding on a number that physics holds constant; scaled up it would look like a signal.
@@ -227,7 +227,7 @@ def _split(x: ArrayLike, y: ArrayLike, seed: int) -> tuple[np.ndarray, np.ndarra
     if len(x) < 25:
         raise ValueError(f"a probe needs at least 25 rows, got {len(x)}")
     held_out, kept = np.split(np.random.default_rng(seed).permutation(len(x)), [len(x) // 5])
-    x, y = _standardized(x, x[kept]), _standardized(y, y[kept])
+    x, y = standardized(x, x[kept]), standardized(y, y[kept])
     return x[kept], y[kept], x[held_out], y[held_out]
 
 

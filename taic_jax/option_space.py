@@ -12,7 +12,13 @@ from jaxtyping import Array, Float, Key
 from taic_jax.config import OptionsConfig
 from taic_jax.envs.base import Env
 from taic_jax.envs.wrappers import AutoReset
-from taic_jax.measures import active_dimensions, kl_per_dimension, measure_option_space
+from taic_jax.measures import (
+    active_dimensions,
+    distance_correlation,
+    kl_per_dimension,
+    measure_option_space,
+    standardized,
+)
 from taic_jax.networks import apply
 from taic_jax.options.dataset import Experience, gather, make_dataset
 from taic_jax.options.execution import Executor, make_executor
@@ -68,6 +74,16 @@ def _prior(obs: Float[Array, "B S"], noise: Float[Array, "B D"]) -> tuple[Array,
 
 def _choose(option: Float[Array, "B D"], obs: Float[Array, "B S"], noise: Array) -> tuple[Array, Array]:
     return option, jnp.zeros(len(option))
+
+
+def order(env: Env, config: OptionsConfig, model: OptionModel, key: Key[Array, ""], count: int = 500) -> float:
+    """Return the distance correlation of options from the prior and of the change that each causes in one state."""
+    key_prior, key_run = jax.random.split(key)
+    executor = make_executor(as_arrays(config), env.action_size, model)
+    option = jax.random.normal(key_prior, (count, executor.option_size))
+    effects = jax.device_get(jax.jit(partial(execute, env))(executor, option, key_run))
+    change = effects.end - effects.start
+    return distance_correlation(effects.option, standardized(change, change))
 
 
 class Encoded(struct.PyTreeNode):

@@ -7,7 +7,7 @@ import pytest
 from probes import NO, Counting, Probe, Repeat
 
 from taic_jax.config import OptionsConfig
-from taic_jax.option_space import WARM_UP, encode_windows, execute, measure
+from taic_jax.option_space import WARM_UP, encode_windows, execute, measure, order
 from taic_jax.options.dataset import Experience
 from taic_jax.options.learning import learn
 
@@ -76,3 +76,8 @@ def test_measures_a_model():
         assert told[f"{kind}/distance_correlation"] > 0.8 and told[f"{kind}/mlp_r2/change"] > 0.8
     assert told["window/mlp_r2/start"] < 0.2 and "prior/one/mlp_r2/start" not in told
     assert told["active_dimensions"] == 1 and told["kl"] > 1 and told["data/many/ticks"] == 1
+    ordered = order(Moving(), config, model, jax.random.key(3), count=200)
+    assert abs(ordered - told["prior/one/distance_correlation"]) < 0.1
+    deaf = jax.tree.map(jnp.zeros_like, model.params["decoder"])
+    deaf = model.replace(params={**model.params, "decoder": deaf})
+    assert abs(order(Moving(), config, deaf, jax.random.key(3), count=200)) < 0.05, "nothing depends on the code"
