@@ -100,7 +100,7 @@ def draw(found: dict[str, tuple[dict[str, Runs], list[str]]], out: Path) -> None
     panels[0, 0].set_ylabel("return of an episode")
     panels[1, 1 % len(found)].set_ylabel("share of ticks within 5 m of the goal")
     lines = {line.get_label(): line for line in panels[0, 0].get_lines() if str(line.get_label())[0] != "_"}
-    figure.legend(lines.values(), lines.keys(), loc="outside lower center", ncols=3)
+    figure.legend(lines.values(), lines.keys(), loc="outside lower center", ncols=min(3, 2 * len(found) - 1))
     save(figure, out)
 
 
