@@ -37,7 +37,7 @@ def seen_state(env: Env, state, view: int):
 
 
 def test_the_ant_moves_alike_in_all_of_its_views():
-    """Random actions for ten ticks, far enough to touch the ground: what is seen of one is what the other does."""
+    """Random actions for ten ticks: what is seen of one is what the other does."""
     env = make_env("ant")
     step = jax.jit(jax.vmap(env.step))
     start = jax.jit(env.reset)(jax.random.key(0))
@@ -122,6 +122,12 @@ def test_noise_on_the_state_makes_a_closed_loop_decoder_heed_the_code():
         _, losses = jax.jit(lambda e, k, c=config: learn(c, e, k))(seen, jax.random.key(0))
         kl.append(float(losses["kl_loss"][-50:].mean()))
     assert kl[0] < 0.1 and kl[1] > 0.5, kl
+
+
+def test_all_views_are_not_learnt_from_where_none_are_given():
+    config = OptionsConfig(length=2, select="random", views="all")
+    with pytest.raises(ValueError, match=r"options.views: all needs the views of the body"):
+        learn(config, experience(), jax.random.key(0))
 
 
 def test_a_body_of_one_side_refuses_all_views():

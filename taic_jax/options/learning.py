@@ -198,7 +198,10 @@ def learn(
 
     Raises:
       ShortExperienceError: delta is a quantile, and there is no experience long enough to hold a part of it out.
+      ValueError: all views are asked for, and none given.
     """
+    if config.views == "all" and views is None:
+        raise ValueError("options.views: all needs the views of the body, as in learn(..., views=env.views); got none")
     config = as_arrays(config)
     dataset = make_dataset(experience, config, views)
     rows = dataset.experience
