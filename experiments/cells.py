@@ -163,6 +163,7 @@ def transfers(task: str, run_dir: Path, seeds: int = 10) -> list[Cell]:
         Cell("ant/source-open", with_options(source, opened, experience=folders[:1]), {}, "8"),
     ]
     config = load_config(f"transfer_{task}")
+    fine_tune = config.train.fine_tune
     config = dataclasses.replace(
         with_training(config, baselines=(), fine_tune=FineTuneConfig()),
         evaluate=EvaluateConfig(episodes=20, video_ticks=0),
@@ -170,7 +171,7 @@ def transfers(task: str, run_dir: Path, seeds: int = 10) -> list[Cell]:
         seeds=seeds,
     )
     configs = {
-        "tuned": with_options(with_training(config, fine_tune=ant.train.fine_tune), closed, source=folders[0]),
+        "tuned": with_options(with_training(config, fine_tune=fine_tune), closed, source=folders[0]),
         "flat": with_options(with_training(config, baselines=("flat",)), OptionsConfig()),
         "transfer": with_options(with_training(config, baselines=("transfer",)), closed, source=folders[0]),
         "open": with_options(config, opened, source=folders[1]),

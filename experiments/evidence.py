@@ -25,7 +25,7 @@ from taic_jax.devices import Devices, make_devices, open_devices
 from taic_jax.experiments.cells import PATHS, SPACES, Cell, all_cells
 from taic_jax.experiments.option_paths import paths_of
 from taic_jax.experiments.spaces import example_space, measure_spaces
-from taic_jax.experiments.table import TABLE, TableError, append_row, read_table, row_of
+from taic_jax.experiments.table import TABLE, TableError, append_row, config_hash, difference, read_table, row_of
 from taic_jax.files import SaveError, save_text
 from taic_jax.logging import RunLogger
 from taic_jax.pipeline import collect, run_pipeline, take_over, train_baseline
@@ -135,10 +135,12 @@ def main(args: Sequence[str] | None = None) -> None:
     arguments = tyro.cli(Arguments, args=args)
     cells = all_cells(arguments.run_dir)
     try:
-        known = {(row["task"], row["method"], row["seed"]) for row in read_table(arguments.table)}
+        rows = {(row["task"], row["method"], row["seed"]): row for row in read_table(arguments.table)}
+        known = set(rows)
         planned = plan(cells, arguments.only, known, arguments.run_dir)
         if arguments.list:
-            show(cells, planned, known, arguments)
+            show(cells, rows, arguments)
+            print(f"{len(planned)} runs to do")
             return
         if not planned:
             print("nothing to do: the table has every row that these runs give")
@@ -156,17 +158,20 @@ def main(args: Sequence[str] | None = None) -> None:
         raise SystemExit(2) from None
 
 
-def show(cells: Sequence[Cell], planned: Sequence[Cell], known: set, arguments: Arguments) -> None:
+def show(cells: Sequence[Cell], rows: dict[tuple[str, str, int], dict[str, Any]], arguments: Arguments) -> None:
     """Print every run: its figure, its interactions, and what is known of it."""
     for cell in cells:
         if arguments.only and not cell.name.startswith(arguments.only):
             continue
         folder = arguments.run_dir / cell.name
-        begun = "finished, to be taken in" if finished(folder) else "begun" if folder.exists() else "missing"
-        state = "in the table" if cell.stages and not missing(cell, known) else begun
+        state = "finished, to be taken in" if finished(folder) else "begun" if folder.exists() else "missing"
+        if cell.stages and not missing(cell, set(rows)):
+            found = [rows[key] for key in cell.keys]
+            state = f"in the table, took {max(row['seconds'] for row in found) / 60:.0f} minutes"
+            if {row["config"] for row in found} != {config_hash(difference(cell.config, arguments.run_dir))}:
+                state += ", is of another config: cut its rows to do it again"
         ticks = cell.config.train.ticks if "collect" not in cell.stages.values() else cell.config.collect.ticks
         print(f"figure {cell.figure}  {cell.name:36} {cell.config.seeds:3} seeds x {ticks:9,} ticks  {state}")
-    print(f"{len(planned)} runs to do")
 
 
 if __name__ == "__main__":

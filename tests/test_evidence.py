@@ -161,7 +161,10 @@ def test_runs_are_done_once_and_taken_in_as_rows(monkeypatch, tmp_path, table, c
     evidence.main(arguments)
     assert capsys.readouterr().out == "nothing to do: the table has every row that these runs give\n"
     evidence.main([*arguments, "--list"])
-    assert capsys.readouterr().out.count("in the table") == 2
+    assert capsys.readouterr().out.count("in the table, took 0 minutes\n") == 2
+    cells[0] = cells[0]._replace(config=with_fields(flat, collect__ticks=96))
+    evidence.main([*arguments, "--list"])
+    assert capsys.readouterr().out.count("of another config") == 1
     example = spaces.example_space(tmp_path / "options")
     assert np.shape(example["options"]) == (spaces.SHOWN, options.options.size)
     ends = np.array(example["ends"])
