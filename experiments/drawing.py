@@ -31,6 +31,9 @@ styled = plt.rc_context({
 """Of every function that draws a figure: its style, which to import it gives to no other's."""
 
 
+LEGEND = "curves: while training; dots: evaluated after it"
+
+
 def draw_curves(
     axes: Axes, ticks: np.ndarray, values: np.ndarray, colour: str, label: str, dashed: bool = False
 ) -> None:
@@ -41,6 +44,11 @@ def draw_curves(
     if len(values) > 1:
         low, high = stratified_interval([values])
         axes.fill_between(ticks, low, high, color=colour, alpha=0.18, linewidth=0, zorder=2)
+
+
+def draw_end(axes: Axes, tick: float, values: np.ndarray, colour: str) -> None:
+    """Draw a dot at the interquartile mean of what each seed [K] returns when it is evaluated after training."""
+    axes.plot(tick, iqm(values), "o", color=colour, markeredgecolor="white", markersize=7, zorder=4)
 
 
 def interactions(axes: Axes, label: str) -> None:

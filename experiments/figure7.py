@@ -22,6 +22,7 @@ from taic_jax.experiments.drawing import (
     BLUE,
     GREEN,
     GREY,
+    LEGEND,
     OLIVE,
     ORANGE,
     PINK,
@@ -30,6 +31,7 @@ from taic_jax.experiments.drawing import (
     RESULTS,
     SKY,
     draw_curves,
+    draw_end,
     empty,
     interactions,
     mark,
@@ -135,8 +137,7 @@ def draw(found: dict[str, tuple[dict[str, Runs], list[str]]], out: Path) -> None
                 shift = runs.pretraining if row else 0
                 flat = "-" not in method
                 draw_curves(axes, runs.grid + shift, runs.curves["return"], COLOURS[method], METHODS[method][0], flat)
-                end = runs.grid[-1] + shift, iqm(runs.numbers["last"])
-                axes.plot(*end, "o", color=COLOURS[method], markeredgecolor="white", markersize=7, zorder=4)
+                draw_end(axes, runs.grid[-1] + shift, runs.numbers["last"], COLOURS[method])
             if not methods:
                 empty(axes)
                 continue
@@ -146,8 +147,7 @@ def draw(found: dict[str, tuple[dict[str, Runs], list[str]]], out: Path) -> None
     for axes in panels[:, 0]:
         axes.set_ylabel("return of an episode")
     lines = {line.get_label(): line for axes in panels[0] for line in axes.get_lines() if line.get_label()[0] != "_"}
-    title = "curves: while training; dots: evaluated after it"
-    figure.legend(lines.values(), lines.keys(), loc="outside lower center", ncols=len(found), title=title)
+    figure.legend(lines.values(), lines.keys(), loc="outside lower center", ncols=len(found), title=LEGEND)
     save(figure, out)
 
 

@@ -19,11 +19,13 @@ from taic_jax.experiments.cells import TRANSFERRED, TRANSFERS
 from taic_jax.experiments.drawing import (
     BLACK,
     BLUE,
+    LEGEND,
     ORANGE,
     PURPLE,
     RED,
     RESULTS,
     draw_curves,
+    draw_end,
     empty,
     interactions,
     mark,
@@ -80,15 +82,19 @@ def numbers(runs: Runs, methods: dict[str, Runs]) -> dict[str, Any]:
 @styled
 def draw(found: dict[str, tuple[dict[str, Runs], list[str]]], out: Path) -> None:
     """Draw a column per task: the return, and where there is a goal the share of ticks spent at it."""
-    figure, panels = plt.subplots(2, len(found), figsize=(4.1 * len(found) + 0.4, 7.0), squeeze=False)
+    goals = any("mean/success" in runs.curves for methods, _ in found.values() for runs in methods.values())
+    names = ("return", "mean/success")[: 1 + goals]
+    size = 4.1 * len(found) + 0.4, 3.0 * len(names) + 1.0
+    figure, panels = plt.subplots(len(names), len(found), figsize=size, squeeze=False)
     for column, (task, (methods, remarks)) in enumerate(found.items()):
-        names = ("return", "mean/success")
         for axes, name in zip(panels[:, column], names, strict=True):
             held = {method: runs for method, runs in methods.items() if name in runs.curves}
             for method, runs in held.items():
                 draw_curves(
                     axes, runs.grid, runs.curves[name], COLOURS[method], TRANSFERRED[method][0], method in BASELINES
                 )
+                if name == "return":
+                    draw_end(axes, runs.grid[-1], runs.numbers["last"], COLOURS[method])
             if held:
                 axes.set_xlim(left=0)
                 interactions(axes, "interactions with the task")
@@ -98,9 +104,12 @@ def draw(found: dict[str, tuple[dict[str, Runs], list[str]]], out: Path) -> None
                 empty(axes)
         mark(panels[0, column], task, remarks)
     panels[0, 0].set_ylabel("return of an episode")
-    panels[1, 1 % len(found)].set_ylabel("share of ticks within 5 m of the goal")
+    if goals:
+        panels[1, 1 % len(found)].set_ylabel("share of ticks within 5 m of the goal")
     lines = {line.get_label(): line for line in panels[0, 0].get_lines() if str(line.get_label())[0] != "_"}
-    figure.legend(lines.values(), lines.keys(), loc="outside lower center", ncols=min(3, 2 * len(found) - 1))
+    figure.legend(
+        lines.values(), lines.keys(), loc="outside lower center", ncols=min(3, 2 * len(found) - 1), title=LEGEND
+    )
     save(figure, out)
 
 
