@@ -46,7 +46,7 @@ def draw_curves(
         axes.fill_between(ticks, low, high, color=colour, alpha=0.18, linewidth=0, zorder=2)
 
 
-def draw_end(axes: Axes, tick: float, values: np.ndarray, colour: str) -> None:
+def draw_end(axes: Axes, tick: int | np.integer, values: np.ndarray, colour: str) -> None:
     """Draw a dot at the interquartile mean of what each seed [K] returns when it is evaluated after training."""
     axes.plot(tick, iqm(values), "o", color=colour, markeredgecolor="white", markersize=7, zorder=4)
 
