@@ -37,8 +37,8 @@ SETTINGS: dict[str, dict[str, Any]] = {
 EXCEPTIONS: dict[tuple[str, str], dict[str, Any]] = {
     ("half_cheetah", "closed"): {"since": 0.0, "fraction": 0.2},
     ("ant", "closed"): {"since": 0.0},
-    # results/space_search.csv: there the constraints of HalfCheetah hide too much, and ask for too little. Its weight
-    # of L_KL leaves less than a nat of Ant's codes.
+    # Of a search on Hopper (results/space_search.csv), where the constraints of HalfCheetah hide too much, and ask for
+    # too little. Its weight of L_KL leaves less than a nat of Ant's codes.
     ("hopper", "open"): {"lambda_pred": 3.0, "lambda_adv": 0.01},
     ("walker2d", "open"): {"lambda_pred": 3.0, "lambda_adv": 0.01},
     ("ant", "open"): {"lambda_kl": 0.001, "lambda_pred": 3.0, "lambda_adv": 0.01},
@@ -157,8 +157,10 @@ def transfers(task: str, run_dir: Path, seeds: int = 10) -> list[Cell]:
     ant = load_config("ant")
     collect = dataclasses.replace(ant.collect, ticks=TICKS["ant"])
     source = one_iteration(dataclasses.replace(ant, collect=collect, seed=FIRST_SEED, seeds=seeds))
-    closed = dataclasses.replace(OptionsConfig(), decoder="closed", **SETTINGS["closed"] | EXCEPTIONS["ant", "closed"])
-    opened = dataclasses.replace(OptionsConfig(), decoder="open", **SETTINGS["open"] | EXCEPTIONS["ant", "open"])
+    opened, closed = (
+        dataclasses.replace(OptionsConfig(), decoder=decoder, **SETTINGS[decoder] | EXCEPTIONS["ant", decoder])
+        for decoder in ("open", "closed")
+    )
     folders = str(run_dir / "ant/source"), str(run_dir / "ant/source-open")
     sources = [
         Cell("ant/source", dataclasses.replace(source, options=closed), {}, "8"),

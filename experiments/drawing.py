@@ -23,15 +23,14 @@ GREY, BLACK, ORANGE, SKY, GREEN, BLUE, RED, PINK = (
 OLIVE, PURPLE = "#a89b00", "#6a1b9a"
 WARNING = "#b00020"
 RESULTS = Path("experiments/results")
+LEGEND = "curves: while training; dots: evaluated after it"
+"""Title of the legend where `draw_curves` and `draw_end` draw."""
 
 styled = plt.rc_context({
     "font.size": 10, "axes.titlesize": 11, "axes.spines.top": False, "axes.spines.right": False,
     "legend.frameon": False, "savefig.dpi": 110, "figure.constrained_layout.use": True,
 })  # fmt: skip
 """Of every function that draws a figure: its style, which to import it gives to no other's."""
-
-
-LEGEND = "curves: while training; dots: evaluated after it"
 
 
 def draw_curves(
@@ -79,8 +78,9 @@ def empty(axes: Axes) -> None:
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write a picture, in 256 colours: hundreds of thin lines take a third of the space so, and look the same."""
+    """Write a picture, a PNG in 256 colours: hundreds of thin lines take a third of the space so, and look the same."""
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path)
-    Image.open(path).convert("RGB").quantize(256).save(path, optimize=True)
+    if path.suffix == ".png":
+        Image.open(path).convert("RGB").quantize(256).save(path, optimize=True)
     print(path)

@@ -165,7 +165,7 @@ def show(cells: Sequence[Cell], rows: dict[tuple[str, str, int], dict[str, Any]]
             continue
         folder = arguments.run_dir / cell.name
         state = "finished, to be taken in" if finished(folder) else "begun" if folder.exists() else "missing"
-        if cell.stages and not missing(cell, set(rows)):
+        if cell.stages and cell.keys <= rows.keys():
             found = [rows[key] for key in cell.keys]
             state = f"in the table, took {max(row['seconds'] for row in found) / 60:.0f} minutes"
             if {row["config"] for row in found} != {config_hash(difference(cell.config, arguments.run_dir))}:

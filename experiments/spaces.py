@@ -56,4 +56,6 @@ def example_space(folder: Path) -> dict[str, Any]:
     key_options, key_run = jax.random.split(jax.random.key(config.seed))
     options = jax.random.normal(key_options, (SHOWN, config.options.size))
     effects = jax.jit(option_space.execute, static_argnums=0)(source, executor, options, key_run)
-    return {"options": options.tolist(), "ends": np.asarray(model.state_scale(effects.end)).tolist()}
+    drawn = {"options": options, "ends": model.state_scale(effects.end)}
+    # More digits than a picture shows would be more than half of the table.
+    return {name: np.asarray(points, np.float64).round(2).tolist() for name, points in drawn.items()}

@@ -81,9 +81,8 @@ def order(env: Env, config: OptionsConfig, model: OptionModel, key: Key[Array, "
     key_prior, key_run = jax.random.split(key)
     executor = make_executor(as_arrays(config), env.action_size, model)
     option = jax.random.normal(key_prior, (count, executor.option_size))
-    effects = jax.device_get(
-        jax.jit(execute, static_argnums=0)(env, executor, option, key_run)
-    )  # one program for all models
+    run = jax.jit(execute, static_argnums=0)  # one program for all models
+    effects = jax.device_get(run(env, executor, option, key_run))
     change = effects.end - effects.start
     return distance_correlation(effects.option, standardized(change, change))
 
