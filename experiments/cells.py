@@ -153,33 +153,33 @@ def transfers(task: str, run_dir: Path, seeds: int = 10) -> list[Cell]:
     """Return the runs of figure 8 on one task; options and policy are of the ant's run `ant/source`.
 
     That is as long as the ant's own runs: after half of it the ant walks too slowly to cross an arena in an episode.
+    Where the task's preset asks for options that steer, they are learnt from what that run met.
     """
-    ant = load_config("ant")
+    ant, steering, preset = load_config("ant"), load_config("ant_steering"), load_config(f"transfer_{task}")
     collect = dataclasses.replace(ant.collect, ticks=TICKS["ant"])
     source = one_iteration(dataclasses.replace(ant, collect=collect, seed=FIRST_SEED, seeds=seeds))
-    opened, closed = (
-        dataclasses.replace(OptionsConfig(), decoder=decoder, **SETTINGS[decoder] | EXCEPTIONS["ant", decoder])
-        for decoder in ("open", "closed")
+    opened = dataclasses.replace(OptionsConfig(), **SETTINGS["open"] | EXCEPTIONS["ant", "open"])
+    walking, opening, turning = (
+        str(run_dir / name) for name in ("ant/source", "ant/source-open", "ant/source-steering")
     )
-    folders = str(run_dir / "ant/source"), str(run_dir / "ant/source-open")
     sources = [
-        Cell("ant/source", dataclasses.replace(source, options=closed), {}, "8"),
-        Cell("ant/source-open", with_options(source, opened, experience=folders[:1]), {}, "8"),
+        Cell("ant/source", source, {}, "8"),
+        Cell("ant/source-open", with_options(source, opened, experience=(walking,)), {}, "8"),
+        Cell("ant/source-steering", with_options(source, steering.options, experience=(walking,)), {}, "8"),
     ]
-    config = load_config(f"transfer_{task}")
-    fine_tune = config.train.fine_tune
     config = dataclasses.replace(
-        with_training(config, baselines=(), fine_tune=FineTuneConfig()),
+        with_training(preset, baselines=(), fine_tune=FineTuneConfig()),
         evaluate=EvaluateConfig(episodes=20, video_ticks=0),
         seed=FIRST_SEED,
         seeds=seeds,
     )
+    closed = with_options(config, config.options, source=turning if config.options == steering.options else walking)
     configs = {
-        "tuned": with_options(with_training(config, fine_tune=fine_tune), closed, source=folders[0]),
+        "tuned": with_training(closed, fine_tune=preset.train.fine_tune),
         "flat": with_options(with_training(config, baselines=("flat",)), OptionsConfig()),
-        "transfer": with_options(with_training(config, baselines=("transfer",)), closed, source=folders[0]),
-        "open": with_options(config, opened, source=folders[1]),
-        "closed": with_options(config, closed, source=folders[0]),
+        "transfer": with_options(with_training(config, baselines=("transfer",)), ant.options, source=walking),
+        "open": with_options(config, opened, source=opening),
+        "closed": closed,
     }
     return sources + [Cell(f"{task}/{name}", each, {name: TRANSFERRED[name][1]}, "8") for name, each in configs.items()]
 

@@ -41,8 +41,12 @@ def test_presets_load_are_valid_and_hold_only_differences(name):
     assert same(changes, defaults) == []
 
 
-FAR = {"collect.ppo.gamma": 0.999, "train.ppo.gamma": 0.999}
-TRANSFERS = {"turn": {"train.fine_tune.std": 0.2}, "maze": FAR | {"env.goal": "uniform"}, "push": FAR, "fall": FAR}
+STEERING = {"options.length": 20, "options.views": "all", "options.state_noise": 1.0, "options.lambda_adv": 0.0}
+MANY = {"num_envs": 64, "rollout_length": 250}
+ARENA = STEERING | {"collect.ppo.gamma": 0.999, "train.ppo.gamma": 0.999, "train.ppo.learning_rate": 6e-4}
+ARENA |= {"train.ppo.minibatch_size": 64} | {f"train.ppo.{field}": value for field, value in MANY.items()}
+DRAWN = {"env.goal": "uniform"} | {f"collect.ppo.{field}": value for field, value in MANY.items()}
+TRANSFERS = {"turn": {"train.fine_tune.std": 0.2}, "maze": ARENA | DRAWN, "push": ARENA, "fall": ARENA}
 
 
 @pytest.mark.parametrize("task", TRANSFERS)
@@ -50,6 +54,10 @@ def test_presets_of_transfer_differ_from_ant_in_what_the_task_asks_for(task):
     every = {"env.name": f"ant_{task}", "train.ticks": 3_000_000, "train.baselines": ("flat", "transfer")}
     expected = dict(walk(load_config("ant"))) | every | TRANSFERS[task]
     assert dict(walk(load_config(f"transfer_ant_{task}"))) == expected
+
+
+def test_options_that_steer_differ_from_those_of_ant_in_how_they_are_learnt():
+    assert dict(walk(load_config("ant_steering"))) == dict(walk(load_config("ant"))) | STEERING
 
 
 CONTROLS = {
