@@ -159,13 +159,13 @@ def transfers(task: str, run_dir: Path, seeds: int = 10) -> list[Cell]:
     collect = dataclasses.replace(ant.collect, ticks=TICKS["ant"])
     source = one_iteration(dataclasses.replace(ant, collect=collect, seed=FIRST_SEED, seeds=seeds))
     opened = dataclasses.replace(OptionsConfig(), **SETTINGS["open"] | EXCEPTIONS["ant", "open"])
-    walking, opening, turning = (
+    closed_run, open_run, steering_run = (
         str(run_dir / name) for name in ("ant/source", "ant/source-open", "ant/source-steering")
     )
     sources = [
         Cell("ant/source", source, {}, "8"),
-        Cell("ant/source-open", with_options(source, opened, experience=(walking,)), {}, "8"),
-        Cell("ant/source-steering", with_options(source, steering.options, experience=(walking,)), {}, "8"),
+        Cell("ant/source-open", with_options(source, opened, experience=(closed_run,)), {}, "8"),
+        Cell("ant/source-steering", with_options(source, steering.options, experience=(closed_run,)), {}, "8"),
     ]
     config = dataclasses.replace(
         with_training(preset, baselines=(), fine_tune=FineTuneConfig()),
@@ -173,12 +173,13 @@ def transfers(task: str, run_dir: Path, seeds: int = 10) -> list[Cell]:
         seed=FIRST_SEED,
         seeds=seeds,
     )
-    closed = with_options(config, config.options, source=turning if config.options == steering.options else walking)
+    steers = config.options == steering.options
+    closed = with_options(config, config.options, source=steering_run if steers else closed_run)
     configs = {
         "tuned": with_training(closed, fine_tune=preset.train.fine_tune),
         "flat": with_options(with_training(config, baselines=("flat",)), OptionsConfig()),
-        "transfer": with_options(with_training(config, baselines=("transfer",)), ant.options, source=walking),
-        "open": with_options(config, opened, source=opening),
+        "transfer": with_options(with_training(config, baselines=("transfer",)), ant.options, source=closed_run),
+        "open": with_options(config, opened, source=open_run),
         "closed": closed,
     }
     return sources + [Cell(f"{task}/{name}", each, {name: TRANSFERRED[name][1]}, "8") for name, each in configs.items()]

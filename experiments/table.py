@@ -93,7 +93,7 @@ def append_row(path: Path, row: dict[str, Any]) -> None:
     """Add a row; a process that is killed leaves the table with it or without it."""
     path.parent.mkdir(parents=True, exist_ok=True)
     lines = path.read_text() if path.exists() else ""
-    save_text(path, f"{lines}{json.dumps(_rounded(row), allow_nan=False)}\n")
+    save_text(path, f"{lines}{json.dumps(_rounded(row), allow_nan=False, separators=(',', ':'))}\n")
 
 
 def row_of(folder: Path, run_dir: Path, method: str, stage: str) -> dict[str, Any]:
