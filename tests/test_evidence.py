@@ -127,7 +127,7 @@ def test_what_is_in_the_table_is_not_done_again(tmp_path):
         assert evidence.sources(cell, tmp_path) <= {before.name for before in cells[:position]}
     names = [cell.name for cell in evidence.plan(cells, ("hopper/fixed-open-both",), set(), tmp_path)]
     assert names == ["hopper/strong", "hopper/fixed-open-both"], "and what it learns from is done before"
-    for options, task in {"open": "ant_turn/open", "steering": "ant_maze/closed"}.items():
+    for options, task in {"open": "ant_turn/open", "steering": "ant_turn/closed"}.items():
         names = [cell.name for cell in evidence.plan(cells, (task,), set(), tmp_path)]
         assert names == ["ant/source", f"ant/source-{options}", task], "and what that learns from before it"
     assert evidence.plan(cells, ("hopper/fixed-open-both",), {("hopper", "fixed-open-both", 200)}, tmp_path) == []

@@ -1,5 +1,6 @@
 """Chunks of a sweep as tasks on a Ray cluster, one a node at a time; a task of a lost node goes on on another."""
 
+import logging
 import os
 import subprocess
 import sys
@@ -44,7 +45,7 @@ def connect(address: str) -> None:
         if probe.returncode:
             last = (probe.stderr.strip().splitlines() or [""])[-1]
             raise ConfigError(_unanswered(address, f"({last})"))
-    ray.init(address, logging_level="ERROR", namespace="taic_jax")
+    ray.init(address, logging_level=logging.ERROR, namespace="taic_jax")
 
 
 def _unanswered(address: str, how: str) -> str:
@@ -84,7 +85,7 @@ def _in_folder(folder: Path, work: Callable[..., Any], task: tuple) -> Any:
             time.sleep(1.0)
 
 
-def _smallest_node() -> dict[str, float]:
+def _smallest_node() -> dict[str, Any]:
     """Return the processors that every node which has any has at least."""
     nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
     least = {kind: min((node[kind] for node in nodes if node.get(kind)), default=0.0) for kind in ("CPU", "GPU")}
