@@ -1,6 +1,7 @@
 """The one place for what MJX and Brax do and this project does not: loose promotion, and idle notes."""
 
 import contextlib
+import io
 import warnings
 from collections.abc import Iterator
 
@@ -17,12 +18,13 @@ _NOTES = (
 def third_party() -> Iterator[None]:
     """Import or call MJX or Brax: promote dtypes and ranks as JAX does by default, and hide idle notes.
 
-    MJX prints at its import that the optional Warp is not installed; therefore standard output is closed.
+    MJX prints at its import that the optional Warp is not installed, and Warp, where it is, greets; therefore what is
+    written to standard output is dropped.
     """
     with (
         jax.numpy_dtype_promotion("standard"),
         jax.numpy_rank_promotion("allow"),
-        contextlib.redirect_stdout(None),
+        contextlib.redirect_stdout(io.StringIO()),
         warnings.catch_warnings(),
     ):
         for note in _NOTES:

@@ -2,6 +2,7 @@
 
 python -m taic_jax.experiments.throughput --task half_cheetah --peers --json throughput.json
 python -m taic_jax.experiments.throughput --task nav2d --scaling --sweep
+python -m taic_jax.experiments.throughput --task ant --num-envs 2048 --training.num-envs 2048   # on a GPU
 """
 
 import dataclasses
@@ -18,7 +19,7 @@ import tyro
 
 from taic_jax import envs
 from taic_jax.compilation import keep_programs
-from taic_jax.config import ConfigError, PPOConfig
+from taic_jax.config import ConfigError, OptionsConfig, PPOConfig
 from taic_jax.config_io import load_config, preset_names
 from taic_jax.envs.errors import MissingExtraError
 from taic_jax.experiments import peers
@@ -33,9 +34,10 @@ from taic_jax.experiments.loops import (
     untrained_rollout,
     untrained_ticks,
 )
+from taic_jax.experiments.peers.brax_ppo import PIPELINES, DoesNotRunError, ticks_per_second
 from taic_jax.experiments.processes import SeedsApart, Sweep, starts, sweep_costs
 from taic_jax.experiments.turns import Loop, Speeds, take_turns
-from taic_jax.options.execution import IdentityExecutor
+from taic_jax.options.execution import Executor, IdentityExecutor
 
 HEADLINE = "option_training"
 PAPER = ("fixed", "open")
@@ -52,6 +54,10 @@ class Arguments:
     """Measure other libraries at the same work too (extra peers), on Gymnasium's models."""
     model: Literal["", "brax", "gym"] = ""
     """MJCF and rules of the task, as env.model; empty takes gym beside peers, and brax alone."""
+    backend: Literal["auto", "mujoco", "mjx", "warp"] = "auto"
+    """Physics, as env.backend."""
+    pipelines: tuple[Literal["spring", "positional", "generalized", "mjx"], ...] = PIPELINES
+    """Brax's engines, beside peers."""
     num_envs: int = 256
     """Environments of the engine and of the rollout."""
     rollout_length: int = 128
@@ -92,7 +98,7 @@ def make_env(arguments: Arguments) -> envs.Env:
     """
     takes_model = "model" in envs.environment_options(arguments.task)
     model = arguments.model or ("gym" if arguments.peers and takes_model else "brax")
-    return envs.make_env(arguments.task, model=model)
+    return envs.make_env(arguments.task, arguments.backend, model=model)
 
 
 def our_loops(arguments: Arguments, env: envs.Env) -> list[Loop]:
@@ -112,9 +118,18 @@ def our_loops(arguments: Arguments, env: envs.Env) -> list[Loop]:
     several = {"flat_training": None, HEADLINE: options_config(*PAPER, arguments.steps)}
     for name, options in several.items():
         if name in executors and arguments.seeds > 1:
-            training = SeedsApart(partial(make_env, arguments), arguments.training, arguments.seeds, options)
+            training = several_seeds(arguments, env, executors[name], options)
             loops.append(Loop(f"{name}/{arguments.seeds} seeds", training, training.ticks))
     return loops
+
+
+def several_seeds(
+    arguments: Arguments, env: envs.Env, executor: Executor, options: OptionsConfig | None
+) -> Training | SeedsApart:
+    """Return training of several seeds: side by side on an accelerator, on a CPU split over its cores."""
+    if jax.default_backend() == "cpu":
+        return SeedsApart(partial(make_env, arguments), arguments.training, arguments.seeds, options)
+    return Training(env, executor, arguments.training, arguments.seeds)
 
 
 def peer_loops(arguments: Arguments) -> tuple[list[Loop], dict[str, str]]:
@@ -138,12 +153,10 @@ def peer_loops(arguments: Arguments) -> tuple[list[Loop], dict[str, str]]:
 
 def measure_brax(arguments: Arguments) -> tuple[dict[str, Speeds], dict[str, str]]:
     """Return the speed of Brax's PPO on each pipeline, if it runs, and the remarks on them."""
-    from taic_jax.experiments.peers.brax_ppo import PIPELINES, DoesNotRunError, ticks_per_second
-
     if arguments.task not in peers.BRAX:
         return {}, {"brax": "has no such task"}
     speeds = {}
-    for pipeline in PIPELINES:
+    for pipeline in arguments.pipelines:
         try:
             rounds = ticks_per_second(peers.BRAX[arguments.task], pipeline, arguments.training)
         except DoesNotRunError as error:
@@ -212,7 +225,8 @@ def report(arguments: Arguments) -> dict[str, Any]:
     rows = measure(arguments, env)
     for name in ("engine", "rollout", "flat_training", HEADLINE):
         figures[name] = rows.get(name, {}).get("ticks_per_second")
-    figures |= {"task": arguments.task, "rows": rows, "shares": shares(env, arguments.training, arguments.rounds)}
+    figures |= {"device": jax.devices()[0].device_kind, "task": arguments.task, "rows": rows}
+    figures["shares"] = shares(env, arguments.training, arguments.rounds)
     show(figures)
     if arguments.checkpoints:
         counts = sorted({1, arguments.seeds})
@@ -233,6 +247,7 @@ def report(arguments: Arguments) -> dict[str, Any]:
 
 def show(figures: dict[str, Any]) -> None:
     """Print the table of speeds, and where the time of an iteration goes."""
+    print(f"on {figures['device']}")
     print(f"{figures['task']:32} {'ticks/s':>12} {'of engine':>10} {'of flat':>8} {'first call':>11}")
     for name, told in figures["rows"].items():
         numbers = [

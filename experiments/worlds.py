@@ -18,6 +18,7 @@ import numpy as np
 import tyro
 
 from taic_jax import envs
+from taic_jax.compilation import keep_programs
 from taic_jax.envs.arenas import outside
 from taic_jax.envs.physics.mjx import MjxPhysics
 from taic_jax.envs.physics.mujoco import MujocoPhysics
@@ -83,8 +84,9 @@ def measure(arguments: Arguments, task: str, backend: str) -> dict[str, Any]:
     loops = [Loop("ours", stepping(env, actions), actions[..., 0].size)]
     if hasattr(env.env, "physics"):
         row["contacts"] = possible_contacts(env)
-        bare = bare_engine if backend == "mujoco" else plain_mjx
-        loops.append(Loop("bare", bare(env, actions), actions[..., 0].size))
+        bares = {"mujoco": bare_engine, "mjx": plain_mjx}  # Warp's data cannot be handed in by the batch
+        if backend in bares:
+            loops.append(Loop("bare", bares[backend](env, actions), actions[..., 0].size))
     speeds = take_turns(loops, ROUNDS)
     row["ticks_per_second"] = speeds["ours"].median
     if "bare" in speeds:
@@ -162,6 +164,7 @@ def show(row: dict[str, Any]) -> None:
 def main() -> None:
     """Print the table."""
     arguments = tyro.cli(Arguments)
+    keep_programs()
     tasks = arguments.tasks or (ARENAS if arguments.soak else envs.environment_names())
     rows = []
     for task in tasks:

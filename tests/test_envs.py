@@ -15,6 +15,7 @@ from taic_jax import envs
 from taic_jax.envs import AutoReset, Env, State, TimeLimit, make_env
 from taic_jax.envs.errors import BackendError
 from taic_jax.envs.physics import mjx
+from taic_jax.envs.third_party import third_party
 
 SEEDS, ENVS, TICKS, LIMIT = 2, 3, 100, 30
 
@@ -242,6 +243,13 @@ def test_warp_says_what_it_needs(monkeypatch):
     monkeypatch.undo()
     with pytest.raises((envs.MissingExtraError, BackendError)):
         make_env("ant", "warp")
+
+
+def test_what_mjx_writes_is_dropped(capsys):
+    with third_party():
+        sys.stdout.write("Warp greets\n")
+    print("ours")
+    assert capsys.readouterr().out == "ours\n"
 
 
 def test_gyms_models_need_gymnasium(monkeypatch):

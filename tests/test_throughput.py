@@ -117,6 +117,21 @@ def test_the_fastest_setting_is_kept_and_the_others_closed(monkeypatch):
     assert [peer.closed for peer in made] == [True, False, True]
 
 
+def test_several_seeds_of_an_accelerator_are_trained_in_one_process(monkeypatch):
+    arguments = throughput.Arguments("nav2d", training=TINY, seeds=3)
+    env = throughput.make_env(arguments)
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    training = throughput.several_seeds(arguments, env, IdentityExecutor(2), None)
+    assert isinstance(training, Training)
+    assert training.ticks == 3 * TICKS
+
+
+def test_the_backend_is_the_one_asked_for():
+    for backend, has_engine in (("mujoco", True), ("mjx", False)):
+        env = throughput.make_env(throughput.Arguments("hopper", backend=backend))
+        assert hasattr(env.physics, "engine") == has_engine
+
+
 def test_brax_that_fails_is_told_in_one_line(monkeypatch):
     def fail(*_, **__):
         raise AttributeError("no such function\nand more")
@@ -132,11 +147,14 @@ def test_brax_is_asked_for_the_same_work(monkeypatch):
 
     def train(env, **settings):
         asked.update(settings)
+        asked["replicated"] = jax.device_put_replicated({"x": jax.numpy.arange(2)}, jax.local_devices()[:1])
         for _ in range(settings["num_evals"] - 1):
             settings["progress_fn"](0, {})
 
     monkeypatch.setattr("brax.training.agents.ppo.train.train", train)
     assert len(brax_ppo.ticks_per_second("halfcheetah", "spring", WORK)) == brax_ppo.ITERATIONS
+    assert asked["replicated"]["x"].tolist() == [[0, 1]]
+    assert "device_put_replicated" not in vars(jax)
     # What Brax makes of an iteration: the ticks of batches of environments, and a step on each, in epochs.
     batches = asked["batch_size"] * asked["num_minibatches"]
     assert batches == asked["num_envs"] == 64
