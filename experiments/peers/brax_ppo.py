@@ -39,7 +39,8 @@ def ticks_per_second(name: str, pipeline: str, config: PPOConfig) -> list[float]
     times = [time.perf_counter()]
     ticks = config.num_envs * config.rollout_length
     minibatches = ticks // config.minibatch_size
-    with third_party(), mock.patch.object(jax, "device_put_replicated", _replicated, create=True):
+    replicate = getattr(jax, "device_put_replicated", _replicated)
+    with third_party(), mock.patch.object(jax, "device_put_replicated", replicate, create=True):
         from brax import envs
         from brax.training.agents.ppo import networks, train
 
