@@ -89,7 +89,7 @@ def _same(rows: Tree) -> Tree:
 
 
 def open_devices(shard: Shard, rows: int, hosts: Hosts = ALONE) -> Shard:
-    """Have JAX take each physical core of a CPU for a device, no more than there are rows; return what to split.
+    """Have JAX take each physical core of a CPU for a device, or fewer where rows want no more; return what to split.
 
     To be called before anything is computed. A number of devices that JAX was told is kept. Over several hosts, wait
     for the others.
@@ -100,13 +100,21 @@ def open_devices(shard: Shard, rows: int, hosts: Hosts = ALONE) -> Shard:
     told = "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
     if shard != "none" and not told and jax.config.values["jax_num_cpu_devices"] < 1:
         cores = num_physical_cores()
-        jax.config.update("jax_num_cpu_devices", cores if shard == ENVS else min(cores, -(-rows // hosts.count)))
+        jax.config.update("jax_num_cpu_devices", cores if shard == ENVS else fewest(-(-rows // hosts.count), cores))
     if hosts.count > 1:
         join(hosts)
     if shard == "auto":
         alone = ENVS if hosts.count > 1 else "none"
         return SEEDS if min(rows, jax.device_count()) > 1 else alone
     return shard
+
+
+def fewest(rows: int, cores: int) -> int:
+    """Return the fewest devices, each a core, that have as few rows each as with all cores.
+
+    Of ten rows on eight cores some core has two: then five do, and nobody repeats a row.
+    """
+    return -(-rows // -(-rows // cores))
 
 
 def make_devices(shard: Shard, config: Config) -> Devices:

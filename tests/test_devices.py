@@ -13,7 +13,7 @@ from tiny_runs import CONFIG, SLOPE, KilledError, die, last_state, rows_of, tiny
 
 from taic_jax.checkpoint import Checkpoints
 from taic_jax.config_io import to_yaml
-from taic_jax.devices import Devices, over_envs
+from taic_jax.devices import Devices, fewest, over_envs
 from taic_jax.envs import PhysicsState, make_env
 from taic_jax.envs.physics.mujoco import num_physical_cores
 from taic_jax.run import main
@@ -120,6 +120,13 @@ def test_what_is_taken_is_on_one_device_so_that_nothing_is_exchanged_later(shard
     for row, back in zip(rows, taken, strict=True):
         assert back.devices() == {jax.local_devices()[0]}
         assert (back == row).all()
+
+
+@pytest.mark.parametrize(
+    ("rows", "cores", "devices"), [(10, 8, 5), (10, 16, 10), (10, 2, 2), (3, 2, 2), (9, 4, 3), (1, 8, 1), (8, 8, 8)]
+)
+def test_no_more_cores_are_taken_than_shorten_the_longest_queue_of_rows(rows, cores, devices):
+    assert fewest(rows, cores) == devices
 
 
 def test_cores_of_a_cpu_become_devices_no_more_than_rows():
