@@ -25,7 +25,7 @@ from taic_jax.envs.errors import ContractError, EnvOptionError, MissingExtraErro
 from taic_jax.envs.locomotion import Locomotion
 from taic_jax.envs.navigation import Navigation
 from taic_jax.envs.physics import BACKENDS
-from taic_jax.envs.robots import ROBOTS
+from taic_jax.envs.robots import ROBOTS, with_body
 from taic_jax.envs.wrappers import AutoReset, TimeLimit, Wrapper
 
 __all__ = [
@@ -64,16 +64,17 @@ class _Task(NamedTuple):
     has_engine: bool = True
 
 
-def _make_robot(name: str, model: str, backend: str, num_threads: int) -> Env:
+def _make_robot(name: str, model: str, backend: str, num_threads: int, body: str = "gym") -> Env:
     if model not in ROBOTS:
         raise UnknownNameError("model", model, ROBOTS)
-    return Locomotion(name, ROBOTS[model][name], backend, num_threads)
+    return Locomotion(name, with_body(ROBOTS[model][name], body), backend, num_threads)
 
 
 _TASKS = {
     "nav2d": _Task(Navigation, ("change_after",), has_engine=False),
     "nav2d_random": _Task(partial(Navigation, random_ends=True), has_engine=False),
     **{name: _Task(partial(_make_robot, name), ("model",)) for name in ROBOTS["brax"]},
+    "ant": _Task(partial(_make_robot, "ant"), ("model", "body")),
     "ant_turn": _Task(partial(AntTurn, "ant_turn", ROBOTS["brax"]["ant"])),
     "ant_maze": _Task(partial(AntArena, "ant_maze", MAZE), ("body", "goal")),
     "ant_push": _Task(partial(AntArena, "ant_push", PUSH), ("body",)),
@@ -115,7 +116,7 @@ def make_env(
       num_threads: threads of the `mujoco` backend; 0 takes one per physical core.
       pipeline: physics of `brax:NAME`: `spring`, `positional`, `generalized` or `mjx`.
       model: MJCF and rules of the running robots: `brax`, or `gym` for Gymnasium's own.
-      body: of the ant in an arena: `gym`, the one of `ant`, or `hiro`.
+      body: of the ant, alone or in an arena: `gym`, or `hiro`, which is weaker and slower.
       goal: of the maze: `fixed`, `near`, or `uniform` while training.
       change_after: episodes after which the room of `nav2d` changes; 0 for never.
 

@@ -14,7 +14,7 @@ from taic_jax.envs.arenas import ANT_QPOS, ANT_QVEL, Arena, furnish
 from taic_jax.envs.base import PhysicsState, State
 from taic_jax.envs.errors import UnknownNameError
 from taic_jax.envs.locomotion import Locomotion
-from taic_jax.envs.robots import ROBOTS, Robot, compile_spec, initial_qpos, load_spec
+from taic_jax.envs.robots import ROBOTS, compile_spec, initial_qpos, load_spec, with_body
 
 SUCCESS_RADIUS = 5.0  # m, of HIRO
 
@@ -27,10 +27,6 @@ class TurningState(PhysicsState):
 
 class AntTurn(Locomotion):
     """Turn left: the reward of `ant` with the yaw rate in rad/s in place of the forward speed."""
-
-    def __init__(self, name: str, robot: Robot, backend: str = "auto", num_threads: int = 0):
-        super().__init__(name, robot, backend, num_threads)
-        self.proprioception = "ant"
 
     def _begin(self, physics: PhysicsState) -> TurningState:
         return TurningState(physics.qpos, physics.qvel, physics.qacc_warmstart, turns=jnp.zeros(()))
@@ -63,7 +59,7 @@ class AntArena(Locomotion):
     Args:
       name: the task's.
       arena: the room.
-      body: `gym`, the ant of `ant`; or `hiro`, with a fifth of its strength and ticks twice as long, 500 of them.
+      body: of the ant, see `with_body`; options learnt on `ant` apply where it has the same.
       goal: `fixed`; `near`, where the arena has one; or, as in HIRO's maze, `uniform` in the room while training and
         fixed in evaluation.
       backend: see `make_physics`.
@@ -82,21 +78,15 @@ class AntArena(Locomotion):
         backend: str = "auto",
         num_threads: int = 0,
     ):
-        if body not in ("gym", "hiro"):
-            raise UnknownNameError("body", body, ("gym", "hiro"))
         goals = ("fixed", "uniform") if arena.near_goal is None else ("fixed", "near", "uniform")
         if goal not in goals:
             raise UnknownNameError("goal", goal, goals)
         if goal == "near":
             arena = dataclasses.replace(arena, goal=arena.near_goal)
-        self.arena, self.body, self.uniform_goal = arena, body, goal == "uniform"
-        robot = dataclasses.replace(
-            ROBOTS["brax"]["ant"], start_in_default_pose=body == "hiro", iterations=4, ls_iterations=8
-        )
-        self.episode_length = 500 if body == "hiro" else 1000
+        self.arena, self.uniform_goal = arena, goal == "uniform"
+        robot = dataclasses.replace(with_body(ROBOTS["brax"]["ant"], body), iterations=4, ls_iterations=8)
         super().__init__(name, robot, backend, num_threads)
         self.proprioceptive_size = ANT_QPOS - robot.num_unobserved + ANT_QVEL
-        self.proprioception = "ant" if body == "gym" else "hiro_ant"
 
     @property
     def evaluated(self) -> "AntArena":
@@ -135,10 +125,6 @@ class AntArena(Locomotion):
 
     def _make_model(self) -> mujoco.MjModel:
         spec = load_spec(self.robot)
-        if self.body == "hiro":
-            spec.option.timestep, spec.option.integrator = 0.02, mujoco.mjtIntegrator.mjINT_RK4
-            for actuator in spec.actuators:
-                actuator.gear[0] = 30.0
         furnish(spec, self.arena)
         return compile_spec(spec)
 

@@ -29,8 +29,6 @@ class Locomotion(Env):
       num_threads: see `make_physics`.
     """
 
-    episode_length = 1000  # ticks
-
     def __init__(self, name: str, robot: Robot, backend: str = "auto", num_threads: int = 0):
         self.name = name
         self.robot = robot
@@ -43,12 +41,13 @@ class Locomotion(Env):
             iterations=robot.iterations,
             ls_iterations=robot.ls_iterations,
         )
+        self.episode_length = robot.episode_length
         self.action_size = self.model.nu
         self.dt = self.model.opt.timestep * robot.substeps
         self._init_qpos = jnp.asarray(self._start(), jnp.float32)
         state = jax.eval_shape(self.reset, jax.random.key(0))
         self.observation_size = self.proprioceptive_size = state.obs.shape[0]
-        self.proprioception = name
+        self.proprioception = robot.proprioception or name
 
     @property
     def views(self) -> Views:

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from taic_jax.envs.errors import MissingExtraError
+from taic_jax.envs.errors import MissingExtraError, UnknownNameError
 from taic_jax.envs.views import Signed
 
 
@@ -32,6 +32,12 @@ class Robot:
     healthy_state: float = math.inf  # for every entry of qpos and qvel behind the first two
     velocity_limit: float = math.inf  # at which velocities are clipped in obs
     start_in_default_pose: bool = False  # and not in the model's numeric `init_qpos`
+    episode_length: int = 1000  # ticks
+    proprioception: str = ""  # name of the slice of obs that its tasks share; empty for the task's
+    # Of the engine; None for the model's own.
+    timestep: float | None = None  # s
+    integrator: mujoco.mjtIntegrator | None = None
+    gear: float | None = None  # N m, of every motor at an action of 1
     # MJX's solver and line search; None for the model's own. `experiments.worlds --solver` measures them.
     iterations: int | None = None
     ls_iterations: int | None = 4
@@ -72,6 +78,7 @@ _ANT = Robot(
     healthy_reward=1.0,
     healthy_height=(0.2, 1.0),
     height_index=2,
+    proprioception="ant",
     sides=4,
     # Height, quaternion, joints; then the speeds of torso and joints.
     turned_obs=(
@@ -103,6 +110,9 @@ _WALKER2D = dataclasses.replace(
 )
 _GYM = {"root_height": 0.0, "final_healthy_reward": False, "start_in_default_pose": True}
 
+BODIES = ("gym", "hiro")
+"""Of the ant, by the config's `env.body`."""
+
 # By the config's `env.model`. `gym` is Gymnasium's own MJCF, integrator and rules of version 5, without the
 # ant's contact forces, which MJX does not compute and which cost at most 42 an episode.
 ROBOTS: dict[str, dict[str, Robot]] = {
@@ -116,6 +126,27 @@ ROBOTS: dict[str, dict[str, Robot]] = {
 }
 
 
+def with_body(ant: Robot, body: str) -> Robot:
+    """Return the ant with the body of `gym`, as it is; or of `hiro`, with a fifth of its strength and longer ticks.
+
+    Raises:
+      UnknownNameError: there is no such body.
+    """
+    if body not in BODIES:
+        raise UnknownNameError("body", body, BODIES)
+    if body == "gym":
+        return ant
+    return dataclasses.replace(
+        ant,
+        start_in_default_pose=True,
+        episode_length=500,
+        proprioception="hiro_ant",
+        timestep=0.02,
+        integrator=mujoco.mjtIntegrator.mjINT_RK4,
+        gear=30.0,
+    )
+
+
 def load_spec(robot: Robot) -> mujoco.MjSpec:
     """Read the robot's MJCF from the package that ships it, found without importing that (which is slow).
 
@@ -126,7 +157,14 @@ def load_spec(robot: Robot) -> mujoco.MjSpec:
     found = importlib.util.find_spec(package)
     if found is None or found.origin is None:
         raise MissingExtraError(package, "gym" if package == "gymnasium" else None)
-    return mujoco.MjSpec.from_file(str(Path(found.origin).parent / path))
+    spec = mujoco.MjSpec.from_file(str(Path(found.origin).parent / path))
+    if robot.timestep is not None:
+        spec.option.timestep = robot.timestep
+    if robot.integrator is not None:
+        spec.option.integrator = robot.integrator
+    for actuator in spec.actuators if robot.gear is not None else ():
+        actuator.gear[0] = robot.gear
+    return spec
 
 
 def compile_spec(spec: mujoco.MjSpec) -> mujoco.MjModel:

@@ -32,7 +32,7 @@ class EnvConfig:
     model: Literal["brax", "gym"] = "brax"
     """MJCF and rules of half_cheetah, ant, hopper and walker2d: Brax's, or Gymnasium's own."""
     body: Literal["gym", "hiro"] = "gym"
-    """Ant of ant_maze, ant_push and ant_fall: the one of ant, or HIRO's weaker one."""
+    """Ant of ant, ant_maze, ant_push and ant_fall: Gym's, or HIRO's, which is weaker and acts half as often."""
     goal: Literal["fixed", "near", "uniform"] = "fixed"
     """Goal of ant_maze: behind the walls, at the end of the first corridor, or drawn in each episode of training and
     behind the walls in evaluation."""

@@ -184,12 +184,27 @@ def test_near_goal_is_straight_ahead_and_the_fixed_one_behind_a_wall():
         AntArena("ant_push", PUSH, goal="near")
 
 
-def test_hiros_body_is_weaker_and_slower():
-    env = task("ant_maze", body="hiro")[0]
-    assert env.dt == pytest.approx(0.1) and env.episode_length == 500
+@pytest.mark.parametrize("name", ["ant", "ant_maze"])
+def test_hiros_body_is_weaker_and_slower(name):
+    env = task(name, body="hiro")[0]
+    assert env.dt == pytest.approx(0.1) and env.episode_length == 500 and env.proprioception == "hiro_ant"
     assert env.model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
     np.testing.assert_array_equal(env.model.actuator_gear[:, 0], 30)
-    np.testing.assert_allclose(start("ant_maze", 50, body="hiro").physics.qpos.mean(0)[:3], [0, 0, 0.75], atol=0.04)
+    np.testing.assert_allclose(start(name, 50, body="hiro").physics.qpos.mean(0)[:3], [0, 0, 0.75], atol=0.04)
+
+
+@pytest.mark.parametrize("body", ["gym", "hiro"])
+def test_an_ant_in_the_maze_moves_as_the_one_outside_it(body):
+    """In the air, under the same actions; on the floor capsules and spheres choose other axes of friction."""
+    alone, inside = start("ant", 4, body=body), start("ant_maze", 4, body=body)
+    qpos, qvel = alone.physics.qpos.at[:, 2].add(5.0), alone.physics.qvel
+    alone, inside = (s.replace(physics=s.physics.replace(qpos=qpos, qvel=qvel)) for s in (alone, inside))
+    for action in np.random.default_rng(0).uniform(-1, 1, (8, 4, 8)).astype(np.float32):
+        alone, inside = task("ant", body=body)[2](alone, action), task("ant_maze", body=body)[2](inside, action)
+        np.testing.assert_allclose(inside.obs[:, :27], alone.obs, atol=1e-3)
+
+
+def test_unknown_bodies_and_goals_are_told_the_nearest():
     for options in ({"body": "hero"}, {"goal": "unifrom"}):
         with pytest.raises(UnknownNameError, match=r"did you mean '(hiro|uniform)'"):
             make_env("ant_maze", "mujoco", **options)
