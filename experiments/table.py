@@ -150,12 +150,29 @@ def pretraining_of(config: Config) -> int:
 
 
 def curves_of(rows: Sequence[dict[str, Any]], stage: str, grid: np.ndarray) -> dict[str, list]:
-    """Return what figures draw of the training [K, G]: the return, and the share of ticks at the goal."""
+    """Return what figures draw of the training [K, G]: the return, and the share of ticks at the goal.
+
+    The environments of a run begin their episodes together, and most are at the goal late in them: an iteration is a
+    part of an episode, so the share is a mean over several.
+    """
     names = [name for name in (f"{stage}/return", f"{stage}/mean/success") if name in rows[0]]
+    values = {name: np.array([row[name] for row in rows], float).T for name in names}
     return {
-        name.removeprefix(f"{stage}/"): on_grid(rows, np.array([row[name] for row in rows], float).T, grid).tolist()
-        for name in names
+        name.removeprefix(f"{stage}/"): (mean_on_grid if "mean" in name else on_grid)(rows, value, grid).tolist()
+        for name, value in values.items()
     }
+
+
+def mean_on_grid(rows: Sequence[dict[str, Any]], values: np.ndarray, grid: np.ndarray, points: int = 2) -> np.ndarray:
+    """Return values [K, G]: at each point of the grid the mean of those [K, I] of the log's rows in the last `points`
+    steps of the grid, or the latest where there is none.
+    """
+    ticks, means = np.array([row["ticks"] for row in rows]), on_grid(rows, values, grid)
+    for g, end in enumerate(grid):
+        recent = (ticks <= end) & (ticks > end - points * grid[0])
+        if recent.any():
+            means[:, g] = values[:, recent].mean(axis=1)
+    return means
 
 
 def on_grid(rows: Sequence[dict[str, Any]], values: np.ndarray, grid: np.ndarray) -> np.ndarray:

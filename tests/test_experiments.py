@@ -4,12 +4,13 @@ import json
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from taic_jax.config import PPOConfig
 from taic_jax.experiments import flat_scores, worlds
 from taic_jax.experiments.cells import all_cells
-from taic_jax.experiments.table import TABLE, config_hash, difference, read_table
+from taic_jax.experiments.table import TABLE, config_hash, curves_of, difference, read_table
 
 TINY = PPOConfig(num_envs=4, rollout_length=32, minibatch_size=32, epochs=1)
 
@@ -58,3 +59,14 @@ def test_every_row_of_the_published_table_is_of_the_run_that_would_be_done_today
     for row in rows:
         key = row["task"], row["method"], row["seed"]
         assert hashes.get(key) == row["config"], f"{'/'.join(map(str, key))}: cut this row, or undo what changed it"
+
+
+def test_shares_of_ticks_are_means_over_two_points_of_the_grid_and_returns_the_latest():
+    """Three iterations to a point, then one that is as long as three points."""
+    ticks, grid = [10, 20, 30, 40, 50, 60, 150], np.array([30, 60, 90, 120, 150])
+    rows = [
+        {"ticks": t, "flat/return": [float(i)], "flat/mean/success": [float(i % 3 == 2)]} for i, t in enumerate(ticks)
+    ]
+    curves = curves_of(rows, "flat", grid)
+    assert curves["return"] == [[2, 5, 5, 5, 6]]
+    np.testing.assert_allclose(curves["mean/success"], [[1 / 3, 1 / 3, 1 / 3, 1, 0]])
