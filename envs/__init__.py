@@ -74,7 +74,7 @@ _TASKS = {
     "nav2d": _Task(Navigation, ("change_after",), has_engine=False),
     "nav2d_random": _Task(partial(Navigation, random_ends=True), has_engine=False),
     **{name: _Task(partial(_make_robot, name), ("model",)) for name in ROBOTS["brax"]},
-    "ant": _Task(partial(_make_robot, "ant"), ("model", "body")),
+    "ant": _Task(partial(_make_robot, "ant"), ("model", "body")),  # alone of the robots it has two bodies
     "ant_turn": _Task(partial(AntTurn, "ant_turn", ROBOTS["brax"]["ant"])),
     "ant_maze": _Task(partial(AntArena, "ant_maze", MAZE), ("body", "goal")),
     "ant_push": _Task(partial(AntArena, "ant_push", PUSH), ("body",)),

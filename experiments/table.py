@@ -163,13 +163,13 @@ def curves_of(rows: Sequence[dict[str, Any]], stage: str, grid: np.ndarray) -> d
     }
 
 
-def mean_on_grid(rows: Sequence[dict[str, Any]], values: np.ndarray, grid: np.ndarray, points: int = 2) -> np.ndarray:
-    """Return values [K, G]: at each point of the grid the mean of those [K, I] of the log's rows in the last `points`
+def mean_on_grid(rows: Sequence[dict[str, Any]], values: np.ndarray, grid: np.ndarray) -> np.ndarray:
+    """Return values [K, G]: at each point of the grid the mean of those [K, I] of the log's rows in the last two
     steps of the grid, or the latest where there is none.
     """
     ticks, means = np.array([row["ticks"] for row in rows]), on_grid(rows, values, grid)
     for g, end in enumerate(grid):
-        recent = (ticks <= end) & (ticks > end - points * grid[0])
+        recent = (ticks <= end) & (ticks > end - 2 * grid[0])
         if recent.any():
             means[:, g] = values[:, recent].mean(axis=1)
     return means
