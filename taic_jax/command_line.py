@@ -176,7 +176,7 @@ def _explain(args: Sequence[str], command: type) -> ConfigError:
     known = {f"--{name}": kind for name, kind in hints.items() if name not in ("source", "config", "runs")}
     for option, values in _options(args):
         name = "--" + option.lstrip("-").replace("-", "_")
-        if name not in known:
+        if name not in known or option.endswith("-"):  # tyro keeps the underscore at the end of lambda_
             return ConfigError(f"unknown option {option}; the nearest is {closest(name, known)}")
         try:
             with contextlib.redirect_stderr(io.StringIO()):

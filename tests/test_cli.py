@@ -110,6 +110,7 @@ BAD_ARGUMENTS = {
         "--options.learning_rate_estimator",
     ),
     "unknown group": ("--trian.ticks 3", "--trian.ticks", "--train.ticks"),
+    "hyphen at the end": ("--train.ppo.lambda- 0.9", "unknown option --train.ppo.lambda-;", "is --train.ppo.lambda_"),
     "group as option": ("--train.ppo 3", "unknown option --train.ppo;", "nearest is --train.ppo."),
     "short option": ("-x", "unknown option -x", "nearest"),
     "text for float": ("--train.ppo.clip wide", "--train.ppo.clip: expected a number", "'wide'"),
