@@ -9,40 +9,19 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from tiny_runs import CONFIG, PPO, tiny_steps, with_fields
+from written_runs import TICKS, made_row, written
 
 from taic_jax.config import Config
 from taic_jax.experiments import drawing, evidence, figure5c, figure6, figure7, figure8, option_table, spaces
 from taic_jax.experiments.cells import Cell, all_cells
 from taic_jax.experiments.recovery import AFTER, recovery_of
-from taic_jax.experiments.table import TableError, append_row, config_hash, difference, read_table, row_of, select
+from taic_jax.experiments.table import TableError, config_hash, difference, read_table, row_of, select
 from taic_jax.pipeline import run_pipeline
-
-TICKS = 1000
-
-
-def made_row(task: str, method: str, seed: int, seeds: int, level: float, **changes) -> dict:
-    """Return a row of seeds whose returns rise to level + 0, 1, 2..."""
-    grid = np.arange(1, 51) * (TICKS // 50)
-    last = level + np.arange(seeds)
-    curves = {"return": np.outer(last, grid / TICKS).tolist()}
-    numbers = {"first": np.zeros(seeds).tolist(), "last": last.tolist(), "mean_option": (-last).tolist()}
-    row = {
-        "task": task, "method": method, "seed": seed, "seeds": seeds, "ticks": TICKS, "pretraining": 0,
-        "config": "a", "versions": {"jax": "1"}, "stopped": {}, "grid": grid.tolist(), "curves": curves,
-        "numbers": numbers,
-    }  # fmt: skip
-    return row | changes
 
 
 @pytest.fixture
 def table(tmp_path):
     return tmp_path / "table.jsonl"
-
-
-def written(table, *rows):
-    for row in rows:
-        append_row(table, row)
-    return str(table)
 
 
 def test_rows_come_back_and_a_broken_line_is_refused(table):

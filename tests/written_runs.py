@@ -14,11 +14,14 @@ from taic_jax.config import Config
 from taic_jax.config_io import to_yaml
 from taic_jax.envs import make_env
 from taic_jax.experience import EXPERIENCE, ExperienceStore
+from taic_jax.experiments.table import append_row
 from taic_jax.options.dataset import Experience
 from taic_jax.options.model import OptionModel, Scale, init_params, make_networks
 from taic_jax.statistics import summarize
 
 SEEDS = (1.0, 3.0)
+TICKS = 1000
+"""Of a row of the table of finished runs."""
 
 
 def rows(iterations: int = 3) -> list[dict]:
@@ -74,3 +77,24 @@ def write_options(folder: Path, config: Config = CONFIG, *, experience: bool = T
         action = np.random.default_rng(0).uniform(-1, 1, (2, 32, 4, env.action_size)).astype(np.float32)
         block = Experience(obs, action, action[..., 0], np.zeros((2, 32, 4), bool))
         ExperienceStore(folder / EXPERIENCE, 1, describe(env) | {"seeds": 2}).write(0, block)
+
+
+def made_row(task: str, method: str, seed: int, seeds: int, level: float, **changes) -> dict:
+    """Return a row of seeds whose returns rise to level + 0, 1, 2..."""
+    grid = np.arange(1, 51) * (TICKS // 50)
+    last = level + np.arange(seeds)
+    curves = {"return": np.outer(last, grid / TICKS).tolist()}
+    numbers = {"first": np.zeros(seeds).tolist(), "last": last.tolist(), "mean_option": (-last).tolist()}
+    row = {
+        "task": task, "method": method, "seed": seed, "seeds": seeds, "ticks": TICKS, "pretraining": 0,
+        "config": "a", "versions": {"jax": "1"}, "stopped": {}, "grid": grid.tolist(), "curves": curves,
+        "numbers": numbers,
+    }  # fmt: skip
+    return row | changes
+
+
+def written(table: Path, *rows: dict) -> str:
+    """Write rows to a table and return its name."""
+    for row in rows:
+        append_row(table, row)
+    return str(table)

@@ -1,0 +1,110 @@
+"""Compare rows that were made anew with those of the table: does what the figures show come out again?
+
+python -m taic_jax.experiments.evidence --only walker2d/fixed-open-both --table again.jsonl --run-dir runs/again
+python -m taic_jax.experiments.again again.jsonl
+
+The same seeds on another machine differ in the last bit, and after some steps in everything: a row comes out again
+where its interquartile mean is within the interval of the committed row.
+"""
+
+import dataclasses
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import tyro
+from scipy import stats
+
+from taic_jax.experiments.drawing import RESULTS
+from taic_jax.experiments.figure5c import recovered
+from taic_jax.experiments.figure7 import with_interval, write_numbers
+from taic_jax.experiments.spaces import PREFIX
+from taic_jax.experiments.table import TABLE, Runs, TableError, read_table, select
+from taic_jax.statistics import exact_interval
+
+# What the figures show of a row, where it has it: heading, and the number per seed.
+MEASURES = {
+    "untrained": "first",
+    "return": "last",
+    "distance correlation": f"{PREFIX}prior/one/distance_correlation",
+    "closest approach": "final/closest_approach",
+    "smoothness": "smoothness",
+    "effect of dimension 0": "effect/0",
+    "effect of dimension 1": "effect/1",
+}
+FIELDS = (
+    "task", "method", "seeds", "measure", "value", "low", "high", "again", "again_low", "again_high", "within", "p",
+)  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+    """Compare rows that were made anew with those of the table."""
+
+    again: Annotated[Path, tyro.conf.Positional]
+    """The table of rows made anew, by `evidence --table`."""
+    table: Path = TABLE
+    """The table to compare with."""
+    out: Path = RESULTS / "again.csv"
+    """The comparison."""
+
+
+def counterpart(row: dict[str, Any], rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return the row of the same task, method, seeds and config.
+
+    Raises:
+        TableError: there is none.
+    """
+    name = f"{row['task']}/{row['method']}"
+    for other in rows:
+        if all(row[key] == other[key] for key in ("task", "method", "seed", "seeds")):
+            if row["config"] != other["config"]:
+                raise TableError(f"{name}: made with config {row['config']}, but the table has {other['config']}")
+            return other
+    raise TableError(f"{name}: the table has no row of {row['seeds']} seeds from {row['seed']}")
+
+
+def compare(ours: Runs, theirs: Runs) -> list[dict[str, Any]]:
+    """Return a line per measure: what the table says, what came out again, and whether it is within the interval."""
+    lines = []
+    for measure, name in MEASURES.items():
+        if name in theirs.numbers:
+            values, fresh = theirs.numbers[name], ours.numbers[name]
+            line = {"measure": measure} | with_interval(values, ("value", "low", "high"))
+            line |= with_interval(fresh, ("again", "again_low", "again_high"))
+            lines.append(line | {"p": float(stats.mannwhitneyu(values, fresh).pvalue)})
+    if "success_after" in theirs.numbers:
+        lines.append({"measure": "recovered"} | share(theirs, ("value", "low", "high"))
+                     | share(ours, ("again", "again_low", "again_high")))  # fmt: skip
+    known = {"task": theirs.task, "method": theirs.method, "seeds": len(theirs.seeds)}
+    return [known | line | {"within": line["low"] <= line["again"] <= line["high"]} for line in lines]
+
+
+def share(runs: Runs, names: Sequence[str]) -> dict[str, float]:
+    """Return the share of seeds that recovered, and its exact 95 % interval."""
+    back = recovered(runs)
+    return dict(zip(names, (float(np.mean(back)), *exact_interval(int(back.sum()), len(back))), strict=True))
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Write the comparison, and tell how much of it came out again."""
+    arguments = tyro.cli(Arguments, args=args)
+    lines = []
+    try:
+        committed, fresh = read_table(arguments.table), read_table(arguments.again)
+        if not fresh:
+            raise TableError(f"{arguments.again}: no rows; python -m taic_jax.experiments.evidence --table makes them")
+        for row in fresh:
+            pair = [select([each], row["task"], row["method"]) for each in (row, counterpart(row, committed))]
+            lines += compare(*pair)
+    except TableError as error:
+        print(f"again: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
+    write_numbers(lines, FIELDS, arguments.out)
+    print(f"{sum(line['within'] for line in lines)} of {len(lines)} within the interval")
+
+
+if __name__ == "__main__":
+    main()
