@@ -6,6 +6,7 @@ import pytest
 from written_runs import made_row, written
 
 from taic_jax.experiments import again
+from taic_jax.experiments.table import TABLE, read_table
 
 
 def compared(folder, committed, fresh):
@@ -35,6 +36,11 @@ def test_the_share_that_recovered_has_its_exact_interval(tmp_path):
     (line,) = [line for line in compared(tmp_path, rows[:1], rows[1:]) if line["measure"] == "recovered"]
     assert (line["value"], line["low"], line["high"]) == ("0.9", "0.555", "0.9975")  # Clopper and Pearson
     assert (line["again"], line["within"], line["p"]) == ("0.5", "False", "")
+
+
+def test_the_committed_table_has_every_measure():
+    known = {name for row in read_table(TABLE) for name in row["numbers"]}
+    assert set(again.MEASURES.values()) | {"success_after"} <= known
 
 
 UNFIT = {
