@@ -39,7 +39,7 @@ from taic_jax.experiments.drawing import (
     save,
     styled,
 )  # fmt: skip
-from taic_jax.experiments.table import TABLE, Runs, TableError, read_table, select
+from taic_jax.experiments.table import DIGITS, TABLE, Runs, TableError, read_table, select
 from taic_jax.statistics import bootstrap_interval, holm, iqm, probability_of_improvement
 
 COLOURS = dict(zip(METHODS, (BLACK, OLIVE, GREY, PINK, SKY, ORANGE, BLUE, GREEN, RED, PURPLE), strict=True))
@@ -48,7 +48,7 @@ FIELDS = (
     "task", "method", "seeds", "ticks", "pretraining", "iqm", "low", "high", "auc", "auc_low", "auc_high",
     "jump_start", "jump_starts_positive", "ticks_to_threshold", "reached", "improvement", "improvement_low",
     "improvement_high", "p_holm", "improvement_on_weak", "improvement_at_same_total", "mean", "improvement_of_means",
-    "remarks",
+    "improvement_of_means_at_same_total", "remarks",
 )  # fmt: skip
 
 
@@ -85,8 +85,8 @@ def with_interval(values: np.ndarray, names: Sequence[str] = ("iqm", "low", "hig
     return dict(zip(names, (float(iqm(values)), *bootstrap_interval(values)), strict=True))
 
 
-def numbers(runs: Runs, methods: dict[str, Runs]) -> dict[str, Any]:
-    """Return what the table of the figure says of one method, beside flat PPO on the same task."""
+def numbers(runs: Runs, methods: dict[str, Runs]) -> list[dict[str, Any]]:
+    """Return what the table of the figure says of one method, in one row, beside flat PPO on the same task."""
     last, curve = runs.numbers["last"], runs.curves["return"]
     area = np.nanmean(curve, axis=1)
     row = {"task": runs.task, "method": runs.method, "seeds": len(last), "ticks": runs.ticks}
@@ -94,7 +94,7 @@ def numbers(runs: Runs, methods: dict[str, Runs]) -> dict[str, Any]:
     row |= with_interval(last) | with_interval(area, ("auc", "auc_low", "auc_high"))
     row["mean"] = float(iqm(runs.numbers["mean_option"]))
     if BASELINE not in methods:
-        return row
+        return [row]
     flat = methods[BASELINE]
     # Half of what flat PPO ends with, or of what it gains where that is more.
     threshold = iqm(flat.numbers["last"]) / 2
@@ -116,7 +116,9 @@ def numbers(runs: Runs, methods: dict[str, Runs]) -> dict[str, Any]:
     long = methods.get("long")
     if long is not None and runs.pretraining and runs.pretraining + runs.ticks == long.ticks:
         row["improvement_at_same_total"] = probability_of_improvement(last, long.numbers["last"])[0]
-    return row
+        means = [each.numbers["mean_option"] for each in (runs, long)]
+        row["improvement_of_means_at_same_total"] = probability_of_improvement(*means)[0]
+    return [row]
 
 
 def adjust(rows: list[dict[str, Any]]) -> None:
@@ -153,7 +155,7 @@ def draw(found: dict[str, tuple[dict[str, Runs], list[str]]], out: Path) -> None
 
 def write_numbers(rows: list[dict[str, Any]], fields: Sequence[str], out: Path) -> None:
     """Write and print the numbers."""
-    texts = [{k: f"{v:.4g}" if isinstance(v, float) else v for k, v in row.items()} for row in rows]
+    texts = [{k: f"{v:.{DIGITS}g}" if isinstance(v, float) else v for k, v in row.items()} for row in rows]
     with out.open("w", newline="") as file:
         writer = csv.DictWriter(file, fields)
         writer.writeheader()
@@ -167,7 +169,7 @@ def make_figure(
     arguments: Any,
     methods: dict[str, tuple[str, int]],
     draw: Callable[[dict[str, tuple[dict[str, Runs], list[str]]], Path], None],
-    numbers: Callable[[Runs, dict[str, Runs]], dict[str, Any]],
+    numbers: Callable[[Runs, dict[str, Runs]], list[dict[str, Any]]],
     fields: Sequence[str],
 ) -> None:
     """Draw a figure of several tasks and write its numbers.
@@ -177,7 +179,7 @@ def make_figure(
         arguments: `table`, `out` and `tasks`.
         methods: of each task, with label and fewest seeds.
         draw: the picture, from what `read_methods` gives for each task.
-        numbers: of one method beside the others on its task.
+        numbers: rows of one method beside the others on its task.
         fields: of the table of numbers.
     """
     try:
@@ -190,7 +192,7 @@ def make_figure(
         print(f"figure{figure}: {error}", file=sys.stderr)
         raise SystemExit(2) from None
     draw(found, arguments.out)
-    rows = [numbers(runs, held) for held, _ in found.values() for runs in held.values()]
+    rows = [row for held, _ in found.values() for runs in held.values() for row in numbers(runs, held)]
     adjust(rows)
     write_numbers(rows, fields, arguments.out.with_suffix(".csv"))
 

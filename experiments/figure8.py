@@ -2,8 +2,9 @@
 
 python -m taic_jax.experiments.figure8
 
-Reads the table alone. Success is to be within 5 m of the goal at the last tick of an episode (HIRO's definition); a
-seed's success is its share of evaluation episodes under its mean options.
+Reads the table alone, and writes a line of numbers for every measure of every method. Success is to be within 5 m of the
+goal at the last tick of an episode (HIRO's definition); a seed's success is its share of evaluation episodes under its
+mean options. An improvement is the probability that a seed does better than one of a baseline.
 """
 
 import dataclasses
@@ -34,17 +35,23 @@ from taic_jax.experiments.drawing import (
     styled,
 )
 from taic_jax.experiments.figure7 import make_figure, with_interval
-from taic_jax.experiments.table import TABLE, Runs
+from taic_jax.experiments.table import DIGITS, TABLE, Runs
 from taic_jax.statistics import probability_of_improvement
 
 SEEDS = 10
 COLOURS = {"open": ORANGE, "closed": RED, "tuned": PURPLE, "flat": BLACK, "transfer": BLUE}
 BASELINES = ("flat", "transfer")
-# Of the evaluation: name in the row, name in the table of numbers.
-MEASURES = {"final/success": "success", "final/closest_approach": "closest_approach", "mean/upside_down": "upside_down"}
+MEASURES = ("first", "last", "mean_option", "final/success", "final/closest_approach", "final/upside_down")
+LATE = 5
+"""Points of a curve, the last ones, whose mean is a measure of training: a tenth of its ticks."""
+CURVES = {"return": "training/return", "mean/success": "training/success"}
+LOWER = ("final/closest_approach", "final/upside_down")
+"""Measures of which less is better."""
+BOUNDS = ("", "_low", "_high")
 FIELDS = (
-    "task", "method", "seeds", "ticks", "iqm", "low", "high", *MEASURES.values(), "seeds_at_goal", "success_per_seed",
-    "improvement", "improvement_low", "improvement_high", "p_holm", "remarks",
+    "task", "method", "measure", "seeds", "ticks", "iqm", "low", "high", "mean",
+    *(f"improvement_on_{name}{bound}" for name in BASELINES for bound in BOUNDS),
+    "p_holm", "seeds_at_goal", "per_seed", "remarks",
 )  # fmt: skip
 
 
@@ -60,23 +67,40 @@ class Arguments:
     """Panels."""
 
 
-def numbers(runs: Runs, methods: dict[str, Runs]) -> dict[str, Any]:
-    """Return what the table of the figure says of one method; for options the worse of both comparisons."""
-    last = runs.numbers["last"]
-    row: dict[str, Any] = {"task": runs.task, "method": runs.method, "seeds": len(last), "ticks": runs.ticks}
-    row |= with_interval(last)
-    row |= {ours: float(np.mean(runs.numbers[name])) for name, ours in MEASURES.items() if name in runs.numbers}
-    if "final/success" in runs.numbers:
-        success = runs.numbers["final/success"]
-        row |= {"seeds_at_goal": f"{(success >= 0.5).sum()}/{len(success)}"}
-        row |= {"success_per_seed": " ".join(f"{x:.2g}" for x in success)}
-    others = [methods[name] for name in BASELINES if name in methods]
-    if runs.method not in BASELINES and others:
-        compared = [(*probability_of_improvement(last, x.numbers["last"]), x) for x in others]
-        p, interval, worse = min(compared, key=lambda c: c[0])
-        row |= dict(zip(("improvement", "improvement_low", "improvement_high"), (p, *interval), strict=True))
-        row["p"] = float(stats.mannwhitneyu(last, worse.numbers["last"], alternative="greater").pvalue)
-    return row | {"remarks": "; ".join(runs.remarks)}
+def measured(runs: Runs) -> dict[str, np.ndarray]:
+    """Return the measures [K] of one method: those of evaluation, and the end of each curve of training."""
+    late = {ours: np.nanmean(runs.curves[name][:, -LATE:], axis=1) for name, ours in CURVES.items() if name in runs.curves}
+    return {name: runs.numbers[name] for name in MEASURES if name in runs.numbers} | late
+
+
+def at_goal(runs: Runs, measure: str) -> dict[str, str]:
+    """Return how many seeds are at the goal: in half of the evaluation, or at any time in training."""
+    if measure == "final/success":
+        there = runs.numbers[measure] >= 0.5
+    elif measure == "training/success":
+        there = (np.nan_to_num(runs.curves["mean/success"]) > 0).any(axis=1)
+    else:
+        return {}
+    return {"seeds_at_goal": f"{there.sum()}/{len(there)}"}
+
+
+def numbers(runs: Runs, methods: dict[str, Runs]) -> list[dict[str, Any]]:
+    """Return what the table of the figure says of one method, a row per measure; p is of the worse comparison."""
+    rows = []
+    for measure, values in measured(runs).items():
+        row: dict[str, Any] = {"task": runs.task, "method": runs.method, "measure": measure, "seeds": len(values)}
+        row |= {"ticks": runs.ticks, **with_interval(values), "mean": float(np.mean(values)), **at_goal(runs, measure)}
+        row |= {"per_seed": " ".join(f"{x:.{DIGITS}g}" for x in values), "remarks": "; ".join(runs.remarks)}
+        others = {name: measured(methods[name])[measure] for name in BASELINES if name in methods}
+        sign = -1 if measure in LOWER else 1
+        for name, other in others.items():
+            if name != runs.method:
+                p, interval = probability_of_improvement(sign * values, sign * other)
+                row |= {f"improvement_on_{name}{k}": v for k, v in zip(BOUNDS, (p, *interval), strict=True)}
+        if measure == "last" and runs.method not in BASELINES and others:
+            row["p"] = max(stats.mannwhitneyu(values, x, alternative="greater").pvalue for x in others.values())
+        rows.append(row)
+    return rows
 
 
 @styled

@@ -184,7 +184,8 @@ def test_figure_7_marks_what_is_missing(table, tmp_path, monkeypatch):
     numbers = out.with_suffix(".csv").read_text().splitlines()
     options = next(line for line in numbers if ",fixed-open-both," in line)
     assert "1,1,1" in options, "every seed of the one beats every seed of the other"
-    assert options.endswith(",0,-1002,0,4 of 10 seeds"), "but none does at the same total, nor taking mean options"
+    told = "but none does at the same total, nor taking mean options, of which those of the longer run are worse"
+    assert options.endswith(",0,-1001.5,0,1,4 of 10 seeds"), told
 
 
 def test_option_table_has_a_line_for_every_kind_that_was_run(table, tmp_path):
@@ -244,25 +245,36 @@ def test_figure_6_draws_what_the_table_holds_and_marks_the_rest(table, tmp_path,
     assert len(lines) == 1 + 2 * len(figure6.MEASURES)
 
 
-def test_figure_8_compares_options_with_the_better_baseline(table, tmp_path):
+def test_figure_8_compares_every_measure_with_both_baselines(table, tmp_path):
     """Options return 10 to 14: more than flat PPO's 0 to 4, less than 20 to 24 of flat PPO from Ant's policy."""
     levels = {"flat": 0.0, "transfer": 20.0, "closed": 10.0}
     rows = [made_row("ant_maze", method, 0, 5, level) for method, level in levels.items()]
     for row, share in zip(rows, (0.0, 1.0, 0.4), strict=True):
-        row["numbers"] |= {"final/success": [share] * 4 + [1.0]}
-        row["curves"]["mean/success"] = row["curves"]["return"]
+        row["numbers"] |= {"final/success": [share] * 4 + [1.0], "final/closest_approach": [share] * 5}
+        row["curves"]["mean/success"] = np.outer([0, 0, 0, 1, 1], np.arange(50) == 20).tolist()
     out = tmp_path / "figure8.png"
     figure8.main(["--table", written(table, *rows), "--out", str(out), "--tasks", "ant_maze", "ant_turn"])
     assert out.stat().st_size > 10_000
     with out.with_suffix(".csv").open() as file:
-        numbers = {row["method"]: row for row in csv.DictReader(file)}
-    assert [numbers[name]["improvement"] for name in ("closed", "flat", "transfer")] == ["0", "", ""]
-    assert {name: row["seeds_at_goal"] for name, row in numbers.items()} == {
-        "flat": "1/5",
-        "transfer": "5/5",
-        "closed": "1/5",
+        numbers = {(row["method"], row["measure"]): row for row in csv.DictReader(file)}
+    closed = {measure: row for (method, measure), row in numbers.items() if method == "closed"}
+    improvements = [(row["improvement_on_flat"], row["improvement_on_transfer"]) for row in closed.values()]
+    assert dict(zip(closed, improvements, strict=True)) == {
+        "first": ("0.5", "0.5"),
+        "last": ("1", "0"),
+        "mean_option": ("0", "1"),
+        "final/success": ("0.82", "0.1"),
+        "final/closest_approach": ("0", "1"),
+        "training/return": ("1", "0"),
+        "training/success": ("0.5", "0.5"),
     }
-    assert numbers["closed"]["remarks"] == "5 of 10 seeds" and float(numbers["closed"]["success"]) == 0.52
+    assert closed["training/return"]["mean"] == "11.52", "of 12 on average, the last five points of a straight line"
+    assert numbers["flat", "last"]["improvement_on_flat"] == "" and closed["last"]["per_seed"] == "10 11 12 13 14"
+    at_goal = {name: numbers[name, "final/success"]["seeds_at_goal"] for name in levels}
+    assert at_goal == {"flat": "1/5", "transfer": "5/5", "closed": "1/5"}
+    assert closed["training/success"]["seeds_at_goal"] == "2/5", "at any time, and nothing is left at the end"
+    assert closed["last"]["remarks"] == "5 of 10 seeds" and float(closed["last"]["p_holm"]) > 0.9
+    assert closed["first"]["p_holm"] == "" and closed["final/success"]["mean"] == "0.52"
 
 
 def test_colours_of_near_points_are_alike():
