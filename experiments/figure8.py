@@ -2,9 +2,9 @@
 
 python -m taic_jax.experiments.figure8
 
-Reads the table alone, and writes a line of numbers for every measure of every method. Success is to be within 5 m of the
-goal at the last tick of an episode (HIRO's definition); a seed's success is its share of evaluation episodes under its
-mean options. An improvement is the probability that a seed does better than one of a baseline.
+Reads the table alone, and writes a line of numbers for every measure of every method. Success is to be within 5 m of
+the goal at the last tick of an episode (HIRO's definition); a seed's success is its share of evaluation episodes under
+its mean options. An improvement is the probability that a seed does better than one of a baseline.
 """
 
 import dataclasses
@@ -69,7 +69,8 @@ class Arguments:
 
 def measured(runs: Runs) -> dict[str, np.ndarray]:
     """Return the measures [K] of one method: those of evaluation, and the end of each curve of training."""
-    late = {ours: np.nanmean(runs.curves[name][:, -LATE:], axis=1) for name, ours in CURVES.items() if name in runs.curves}
+    ends = {ours: runs.curves[name][:, -LATE:] for name, ours in CURVES.items() if name in runs.curves}
+    late = {name: np.nanmean(end, axis=1) for name, end in ends.items()}
     return {name: runs.numbers[name] for name in MEASURES if name in runs.numbers} | late
 
 

@@ -1,0 +1,160 @@
+"""Whether codes steer: where an ant goes while one is held, and whether it goes elsewhere under another.
+
+python -m taic_jax.experiments.steering RUN... [--out FILE]
+
+Takes the options of finished runs, draws codes from the prior, and writes a row per run and measure.
+"""
+
+import csv
+import dataclasses
+import sys
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import tyro
+from jaxtyping import Array, Float, Key
+
+from taic_jax.artifacts import load_options
+from taic_jax.checkpoint import ArtifactError
+from taic_jax.config import ConfigError
+from taic_jax.config_io import load_config
+from taic_jax.envs.base import Env, State
+from taic_jax.envs.wrappers import AutoReset, Wrapper
+from taic_jax.experiments.drawing import RESULTS
+from taic_jax.experiments.figure7 import with_interval
+from taic_jax.experiments.table import DIGITS
+from taic_jax.options.execution import Executor, make_executor
+from taic_jax.rl.rollout import Running, rollout, start
+from taic_jax.tasks import make_envs
+from taic_jax.types import as_arrays
+
+CODES, STARTS = 64, 8
+"""Codes of each model, and the starts that each is held from."""
+HELD = 60
+"""Ticks, 3 s of the ant."""
+FIELDS = ("run", "seeds", "ticks_an_option", "measure", "iqm", "low", "high", "per_seed")
+
+
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+    """Measure whether the options of runs steer."""
+
+    runs: tyro.conf.Positional[tuple[Path, ...]]
+    """Folders of finished runs whose options are of the ant."""
+    out: Path = RESULTS / "steering.csv"
+    """The table of numbers."""
+
+
+class Unending(Wrapper):
+    """Goes on after a fall, as the arenas do."""
+
+    def step(self, state: State, action: Float[Array, " A"]) -> State:
+        """Take one tick."""
+        return self.env.step(state, action).replace(terminated=jnp.zeros((), bool))
+
+
+def hold(
+    env: Env, executor: Executor, begin: Running, codes: Float[Array, "N D"], key: Key[Array, ""]
+) -> tuple[Running, Float[Array, "N 2"]]:
+    """Hold a code in each environment, chosen anew whenever its option ends; return what is then, and the way made."""
+    begin = begin.replace(ended=jnp.ones_like(begin.ended))
+    after, _ = rollout(env, executor, lambda obs, noise: (codes, jnp.zeros(len(codes))), begin, key, HELD)
+    return after, after.env.physics.qpos[:, :2] - begin.env.physics.qpos[:, :2]
+
+
+def walk(env: Env, executor: Executor, key: Key[Array, ""]) -> dict[str, Array]:
+    """Return the ways in m, [CODES, STARTS, 2], of codes that are `held`, then `kept`, or `changed` for others.
+
+    `over` [CODES, STARTS] tells whose ants lie on their backs after the change.
+    """
+    key_codes, key_start, key_held, key_after = jax.random.split(key, 4)
+    env = AutoReset(Unending(env))
+    drawn = jax.random.normal(key_codes, (2, CODES, executor.option_size))
+    codes, others = jnp.repeat(drawn, STARTS, axis=1)
+    after, held = hold(env, executor, start(env, executor, len(codes), key_start), codes, key_held)
+    _, kept = hold(env, executor, after, codes, key_after)
+    last, changed = hold(env, executor, after, others, key_after)
+    _, x, y, _ = last.env.physics.qpos[:, 3:7].T
+    ways = {"held": held, "kept": kept, "changed": changed, "over": x**2 + y**2 > 0.5}
+    return jax.tree.map(lambda x: x.reshape(CODES, STARTS, *x.shape[1:]), ways)
+
+
+def angle(a: Float[np.ndarray, "*batch 2"], b: Float[np.ndarray, "*#batch 2"]) -> np.ndarray:
+    """Return the angle between two ways, in [0, 180] degrees."""
+    cross, dot = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0], (a * b).sum(axis=-1)
+    return np.degrees(np.abs(np.arctan2(cross, dot)))
+
+
+def measure(ways: dict[str, np.ndarray]) -> dict[str, float]:
+    """Return the measures of one model's ways.
+
+    Returns: `distance` in m; the share that go `ahead`, within 45 degrees of where the ant faced; the shares that turn
+    by more than 45 degrees under a code that is `changed` or `kept`; the `agreement` of one code's ways from several
+    starts, which is the length of the mean of their unit vectors; and the share that ends `upside_down`.
+    """
+    held = ways["held"]
+    distance = np.linalg.norm(held, axis=-1, keepdims=True)
+    measures = {
+        "distance": distance.mean(),
+        "ahead": (angle(held, np.array([1.0, 0.0])) < 45).mean(),
+        "turned_when_changed": (angle(ways["changed"], held) > 45).mean(),
+        "turned_when_kept": (angle(ways["kept"], held) > 45).mean(),
+        "agreement": np.linalg.norm((held / np.maximum(distance, 1e-9)).mean(axis=1), axis=-1).mean(),
+        "upside_down": ways["over"].mean(),
+    }
+    return {name: float(value) for name, value in measures.items()}
+
+
+def steering_of(folder: Path) -> tuple[int, dict[str, list[float]]]:
+    """Return the ticks an option lasts at most in a run, and the measures of every seed's model [K].
+
+    Raises:
+      ConfigError: its robot cannot go in every direction.
+      ArtifactError: there are no options.
+    """
+    config = load_config(str(folder / "config.yaml"))
+    _, env = make_envs(config)
+    robot: Any = getattr(env, "model", None)
+    if robot is None or robot.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE:
+        expected = "options of a robot that walks in every direction, as ant"
+        raise ConfigError(f"{folder}: expected {expected}, got {env.name}")
+    models = load_options(folder, env, config.options, config.seeds)
+    walked = jax.jit(partial(walk, env))  # one program for all seeds
+    measured = []
+    for seed in range(config.seeds):
+        model = jax.tree.map(lambda x, k=seed: x[k], models)
+        executor = make_executor(as_arrays(config.options), env.action_size, model)
+        measured.append(measure(jax.device_get(walked(executor, jax.random.key(config.seed + seed)))))
+    return config.options.length, {name: [row[name] for row in measured] for name in measured[0]}
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Measure, write the rows and print them."""
+    arguments = tyro.cli(Arguments, args=args)
+    rows = []
+    try:
+        for folder in arguments.runs:
+            length, measures = steering_of(folder)
+            run = "/".join(folder.parts[-2:])
+            for name, values in measures.items():
+                row = {"run": run, "seeds": len(values), "ticks_an_option": length, "measure": name}
+                told = {k: f"{v:.{DIGITS}g}" for k, v in with_interval(np.array(values)).items()}
+                rows.append(row | told | {"per_seed": " ".join(f"{x:.{DIGITS}g}" for x in values)})
+                print("  ".join(f"{k} {v}" for k, v in rows[-1].items()))
+    except (ConfigError, ArtifactError) as error:
+        print(f"steering: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
+    with arguments.out.open("w", newline="") as file:
+        writer = csv.DictWriter(file, FIELDS, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+if __name__ == "__main__":
+    main()
