@@ -152,7 +152,7 @@ def test_runs_are_done_once_and_taken_in_as_rows(monkeypatch, tmp_path, table, c
     assert evidence_row["config"] == strong["config"]
 
 
-def test_flat_ppo_from_another_runs_policy_is_a_run_of_its_own(monkeypatch, tmp_path, table):
+def test_flat_ppo_from_another_runs_policy_is_a_run_of_its_own(monkeypatch, tmp_path, table, capsys):
     """It starts where the source's policy ended, and counts the interactions of that."""
     source = with_fields(CONFIG, collect__env="", options__experience=(), evaluate__video_ticks=0)
     apart = with_fields(source, collect__ticks=16, options__source=str(tmp_path / "source"))
@@ -161,8 +161,14 @@ def test_flat_ppo_from_another_runs_policy_is_a_run_of_its_own(monkeypatch, tmp_
     monkeypatch.setattr(evidence, "all_cells", lambda run_dir: cells)
     begun, train = [], evidence.train_baseline
     monkeypatch.setattr(evidence, "train_baseline", lambda *x: (begun.append(x[3] is not None), train(*x))[1])
+    arguments, told = ["--run-dir", str(tmp_path), "--table", str(table)], []
     with tiny_steps():
-        evidence.main(["--run-dir", str(tmp_path), "--table", str(table)])
+        for each in (["--list"], [], ["--list"]):
+            evidence.main([*arguments, *each])
+            told.append([line.split("ticks  ")[-1] for line in capsys.readouterr().out.splitlines()])
+    took = "in the table, took 0 minutes"
+    assert told[0] == ["done where others need it", "missing", "missing", "3 runs to do"], "the first makes no row"
+    assert told[2] == ["finished", took, took, "0 runs to do"]
     flat, transfer = read_table(table)
     assert (flat["method"], flat["pretraining"], transfer["method"]) == ("flat", 0, "transfer")
     assert transfer["pretraining"] == source.collect.ticks, "and not those of its own config"
