@@ -164,10 +164,12 @@ def show(cells: Sequence[Cell], rows: dict[tuple[str, str, int], dict[str, Any]]
         if arguments.only and not cell.name.startswith(arguments.only):
             continue
         folder = arguments.run_dir / cell.name
-        done, never = (
-            ("finished, to be taken in", "missing") if cell.stages else ("finished", "done where others need it")
-        )
-        state = done if finished(folder) else "begun" if folder.exists() else never
+        if finished(folder):
+            state = "finished, to be taken in" if cell.stages else "finished"
+        elif folder.exists():
+            state = "begun"
+        else:
+            state = "missing" if cell.stages else "made when another run needs it"
         if cell.stages and cell.keys <= rows.keys():
             found = [rows[key] for key in cell.keys]
             state = f"in the table, took {max(row['seconds'] for row in found) / 60:.0f} minutes"

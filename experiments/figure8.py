@@ -4,7 +4,8 @@ python -m taic_jax.experiments.figure8
 
 Reads the table alone, and writes a line of numbers for every measure of every method. Success is to be within 5 m of
 the goal at the last tick of an episode (HIRO's definition); a seed's success is its share of evaluation episodes under
-its mean options. An improvement is the probability that a seed does better than one of a baseline.
+its mean options. `training/success` is a share of ticks. An improvement is the probability that a seed does better than
+one of a baseline, or of options in open loop.
 """
 
 import dataclasses
@@ -43,14 +44,15 @@ COLOURS = {"open": ORANGE, "closed": RED, "tuned": PURPLE, "flat": BLACK, "trans
 BASELINES = ("flat", "transfer")
 MEASURES = ("first", "last", "mean_option", "final/success", "final/closest_approach", "final/upside_down")
 LATE = 5
-"""Points of a curve, the last ones, whose mean is a measure of training: a tenth of its ticks."""
+"""Points of a curve, the last ones, whose mean is a measure of training."""
 CURVES = {"return": "training/return", "mean/success": "training/success"}
 LOWER = ("final/closest_approach", "final/upside_down")
 """Measures of which less is better."""
+COMPARED = (*BASELINES, "open")
 BOUNDS = ("", "_low", "_high")
 FIELDS = (
     "task", "method", "measure", "seeds", "ticks", "iqm", "low", "high", "mean",
-    *(f"improvement_on_{name}{bound}" for name in BASELINES for bound in BOUNDS),
+    *(f"improvement_on_{name}{bound}" for name in COMPARED for bound in BOUNDS),
     "p_holm", "seeds_at_goal", "per_seed", "remarks",
 )  # fmt: skip
 
@@ -92,14 +94,15 @@ def numbers(runs: Runs, methods: dict[str, Runs]) -> list[dict[str, Any]]:
         row: dict[str, Any] = {"task": runs.task, "method": runs.method, "measure": measure, "seeds": len(values)}
         row |= {"ticks": runs.ticks, **with_interval(values), "mean": float(np.mean(values)), **at_goal(runs, measure)}
         row |= {"per_seed": " ".join(f"{x:.{DIGITS}g}" for x in values), "remarks": "; ".join(runs.remarks)}
-        others = {name: measured(methods[name])[measure] for name in BASELINES if name in methods}
+        others = {name: measured(methods[name])[measure] for name in COMPARED if name in methods}
         sign = -1 if measure in LOWER else 1
         for name, other in others.items():
             if name != runs.method:
                 p, interval = probability_of_improvement(sign * values, sign * other)
                 row |= {f"improvement_on_{name}{k}": v for k, v in zip(BOUNDS, (p, *interval), strict=True)}
-        if measure == "last" and runs.method not in BASELINES and others:
-            row["p"] = max(stats.mannwhitneyu(values, x, alternative="greater").pvalue for x in others.values())
+        baselines = [others[name] for name in BASELINES if name in others]
+        if measure == "last" and runs.method not in BASELINES and baselines:
+            row["p"] = max(stats.mannwhitneyu(values, x, alternative="greater").pvalue for x in baselines)
         rows.append(row)
     return rows
 

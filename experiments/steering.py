@@ -1,6 +1,6 @@
 """Whether codes steer: where an ant goes while one is held, and whether it goes elsewhere under another.
 
-python -m taic_jax.experiments.steering RUN... [--out FILE]
+python -m taic_jax.experiments.steering RUN... --out FILE
 
 Takes the options of finished runs, draws codes from the prior, and writes a row per run and measure.
 """
@@ -36,9 +36,9 @@ from taic_jax.types import as_arrays
 
 CODES, STARTS = 64, 8
 """Codes of each model, and the starts that each is held from."""
-HELD = 60
-"""Ticks, 3 s of the ant."""
-FIELDS = ("run", "seeds", "ticks_an_option", "measure", "iqm", "low", "high", "per_seed")
+SECONDS = 3.0
+"""For which a code is held."""
+FIELDS = ("run", "seeds", "length", "measure", "iqm", "low", "high", "per_seed")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,7 +64,9 @@ def hold(
 ) -> tuple[Running, Float[Array, "N 2"]]:
     """Hold a code in each environment, chosen anew whenever its option ends; return what is then, and the way made."""
     begin = begin.replace(ended=jnp.ones_like(begin.ended))
-    after, _ = rollout(env, executor, lambda obs, noise: (codes, jnp.zeros(len(codes))), begin, key, HELD)
+    after, _ = rollout(
+        env, executor, lambda obs, noise: (codes, jnp.zeros(len(codes))), begin, key, round(SECONDS / env.dt)
+    )
     return after, after.env.physics.qpos[:, :2] - begin.env.physics.qpos[:, :2]
 
 
@@ -139,11 +141,13 @@ def main(args: Sequence[str] | None = None) -> None:
     arguments = tyro.cli(Arguments, args=args)
     rows = []
     try:
+        if not arguments.runs:
+            raise ConfigError("expected the folder of at least one run, got none")
         for folder in arguments.runs:
             length, measures = steering_of(folder)
             run = "/".join(folder.parts[-2:])
             for name, values in measures.items():
-                row = {"run": run, "seeds": len(values), "ticks_an_option": length, "measure": name}
+                row = {"run": run, "seeds": len(values), "length": length, "measure": name}
                 told = {k: f"{v:.{DIGITS}g}" for k, v in with_interval(np.array(values)).items()}
                 rows.append(row | told | {"per_seed": " ".join(f"{x:.{DIGITS}g}" for x in values)})
                 print("  ".join(f"{k} {v}" for k, v in rows[-1].items()))

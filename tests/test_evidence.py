@@ -167,7 +167,7 @@ def test_flat_ppo_from_another_runs_policy_is_a_run_of_its_own(monkeypatch, tmp_
             evidence.main([*arguments, *each])
             told.append([line.split("ticks  ")[-1] for line in capsys.readouterr().out.splitlines()])
     took = "in the table, took 0 minutes"
-    assert told[0] == ["done where others need it", "missing", "missing", "3 runs to do"], "the first makes no row"
+    assert told[0] == ["made when another run needs it", "missing", "missing", "3 runs to do"], "the first makes no row"
     assert told[2] == ["finished", took, took, "0 runs to do"]
     flat, transfer = read_table(table)
     assert (flat["method"], flat["pretraining"], transfer["method"]) == ("flat", 0, "transfer")
@@ -257,6 +257,7 @@ def test_figure_8_compares_every_measure_with_both_baselines(table, tmp_path):
     rows = [made_row("ant_maze", method, 0, 5, level) for method, level in levels.items()]
     for row, share in zip(rows, (0.0, 1.0, 0.4), strict=True):
         row["numbers"] |= {"final/success": [share] * 4 + [1.0], "final/closest_approach": [share] * 5}
+        row["numbers"]["final/upside_down"] = [1 - share] * 5
         row["curves"]["mean/success"] = np.outer([0, 0, 0, 1, 1], np.arange(50) == 20).tolist()
     out = tmp_path / "figure8.png"
     figure8.main(["--table", written(table, *rows), "--out", str(out), "--tasks", "ant_maze", "ant_turn"])
@@ -271,6 +272,7 @@ def test_figure_8_compares_every_measure_with_both_baselines(table, tmp_path):
         "mean_option": ("0", "1"),
         "final/success": ("0.82", "0.1"),
         "final/closest_approach": ("0", "1"),
+        "final/upside_down": ("1", "0"),
         "training/return": ("1", "0"),
         "training/success": ("0.5", "0.5"),
     }
