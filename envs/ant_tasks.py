@@ -169,12 +169,11 @@ class AntArena(Locomotion):
         self, before: ArenaState, after: ArenaState, action: Float[Array, " A"]
     ) -> tuple[Float[Array, ""], dict[str, Array]]:
         distance = self._distance(after)
-        _, x, y, _ = after.qpos[3:7]
         metrics = {
             "distance": distance,
             "success": (distance < SUCCESS_RADIUS).astype(jnp.float32),
             "closest_approach": after.closest,
-            "upside_down": (x**2 + y**2 > 0.5).astype(jnp.float32),  # the torso's own z axis points down
+            "upside_down": upside_down(after.qpos[3:7]).astype(jnp.float32),
         }
         return -distance, metrics
 
@@ -183,6 +182,12 @@ def heading(quaternion: Float[Array, " 4"]) -> Float[Array, ""]:
     """Return the yaw in rad of the body's x axis, projected on the ground."""
     w, x, y, z = quaternion
     return jnp.arctan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2))
+
+
+def upside_down(quaternion: Float[Array, " 4"]) -> Bool[Array, ""]:
+    """Return whether the body's own z axis points down."""
+    _, x, y, _ = quaternion
+    return x**2 + y**2 > 0.5
 
 
 def wrapped(angle: Float[Array, "*batch"]) -> Float[Array, "*batch"]:

@@ -153,9 +153,16 @@ def draw(found: dict[str, tuple[dict[str, Runs], list[str]]], out: Path) -> None
     save(figure, out)
 
 
+def as_text(value: Any) -> Any:
+    """Return floats with the digits that rows have, and leave the rest as it is."""
+    if isinstance(value, np.ndarray):
+        return " ".join(f"{x:.{DIGITS}g}" for x in value)
+    return f"{value:.{DIGITS}g}" if isinstance(value, float) else value
+
+
 def write_numbers(rows: list[dict[str, Any]], fields: Sequence[str], out: Path) -> None:
-    """Write and print the numbers."""
-    texts = [{k: f"{v:.{DIGITS}g}" if isinstance(v, float) else v for k, v in row.items()} for row in rows]
+    """Write and print the numbers; an array is one per seed."""
+    texts = [{name: as_text(value) for name, value in row.items()} for row in rows]
     with out.open("w", newline="") as file:
         writer = csv.DictWriter(file, fields)
         writer.writeheader()

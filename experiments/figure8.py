@@ -36,7 +36,7 @@ from taic_jax.experiments.drawing import (
     styled,
 )
 from taic_jax.experiments.figure7 import make_figure, with_interval
-from taic_jax.experiments.table import DIGITS, TABLE, Runs
+from taic_jax.experiments.table import TABLE, Runs
 from taic_jax.statistics import probability_of_improvement
 
 SEEDS = 10
@@ -89,18 +89,17 @@ def at_goal(runs: Runs, measure: str) -> dict[str, str]:
 
 def numbers(runs: Runs, methods: dict[str, Runs]) -> list[dict[str, Any]]:
     """Return what the table of the figure says of one method, a row per measure; p is of the worse comparison."""
-    rows = []
+    rows, others = [], {name: measured(methods[name]) for name in COMPARED if name in methods}
     for measure, values in measured(runs).items():
         row: dict[str, Any] = {"task": runs.task, "method": runs.method, "measure": measure, "seeds": len(values)}
         row |= {"ticks": runs.ticks, **with_interval(values), "mean": float(np.mean(values)), **at_goal(runs, measure)}
-        row |= {"per_seed": " ".join(f"{x:.{DIGITS}g}" for x in values), "remarks": "; ".join(runs.remarks)}
-        others = {name: measured(methods[name])[measure] for name in COMPARED if name in methods}
+        row |= {"per_seed": values, "remarks": "; ".join(runs.remarks)}
         sign = -1 if measure in LOWER else 1
         for name, other in others.items():
             if name != runs.method:
-                p, interval = probability_of_improvement(sign * values, sign * other)
+                p, interval = probability_of_improvement(sign * values, sign * other[measure])
                 row |= {f"improvement_on_{name}{k}": v for k, v in zip(BOUNDS, (p, *interval), strict=True)}
-        baselines = [others[name] for name in BASELINES if name in others]
+        baselines = [others[name][measure] for name in BASELINES if name in others]
         if measure == "last" and runs.method not in BASELINES and baselines:
             row["p"] = max(stats.mannwhitneyu(values, x, alternative="greater").pvalue for x in baselines)
         rows.append(row)

@@ -5,7 +5,6 @@ python -m taic_jax.experiments.steering RUN... --out FILE
 Takes the options of finished runs, draws codes from the prior, and writes a row per run and measure.
 """
 
-import csv
 import dataclasses
 import sys
 from collections.abc import Sequence
@@ -24,11 +23,12 @@ from taic_jax.artifacts import load_options
 from taic_jax.checkpoint import ArtifactError
 from taic_jax.config import ConfigError
 from taic_jax.config_io import load_config
+from taic_jax.envs.ant_tasks import upside_down
 from taic_jax.envs.base import Env, State
 from taic_jax.envs.wrappers import AutoReset, Wrapper
 from taic_jax.experiments.drawing import RESULTS
-from taic_jax.experiments.figure7 import with_interval
-from taic_jax.experiments.table import DIGITS
+from taic_jax.experiments.figure7 import with_interval, write_numbers
+from taic_jax.option_space import always
 from taic_jax.options.execution import Executor, make_executor
 from taic_jax.rl.rollout import Running, rollout, start
 from taic_jax.tasks import make_envs
@@ -64,9 +64,7 @@ def hold(
 ) -> tuple[Running, Float[Array, "N 2"]]:
     """Hold a code in each environment, chosen anew whenever its option ends; return what is then, and the way made."""
     begin = begin.replace(ended=jnp.ones_like(begin.ended))
-    after, _ = rollout(
-        env, executor, lambda obs, noise: (codes, jnp.zeros(len(codes))), begin, key, round(SECONDS / env.dt)
-    )
+    after, _ = rollout(env, executor, partial(always, codes), begin, key, round(SECONDS / env.dt))
     return after, after.env.physics.qpos[:, :2] - begin.env.physics.qpos[:, :2]
 
 
@@ -82,8 +80,8 @@ def walk(env: Env, executor: Executor, key: Key[Array, ""]) -> dict[str, Array]:
     after, held = hold(env, executor, start(env, executor, len(codes), key_start), codes, key_held)
     _, kept = hold(env, executor, after, codes, key_after)
     last, changed = hold(env, executor, after, others, key_after)
-    _, x, y, _ = last.env.physics.qpos[:, 3:7].T
-    ways = {"held": held, "kept": kept, "changed": changed, "over": x**2 + y**2 > 0.5}
+    over = jax.vmap(upside_down)(last.env.physics.qpos[:, 3:7])
+    ways = {"held": held, "kept": kept, "changed": changed, "over": over}
     return jax.tree.map(lambda x: x.reshape(CODES, STARTS, *x.shape[1:]), ways)
 
 
@@ -113,7 +111,7 @@ def measure(ways: dict[str, np.ndarray]) -> dict[str, float]:
     return {name: float(value) for name, value in measures.items()}
 
 
-def steering_of(folder: Path) -> tuple[int, dict[str, list[float]]]:
+def steering_of(folder: Path) -> tuple[int, dict[str, np.ndarray]]:
     """Return the ticks an option lasts at most in a run, and the measures of every seed's model [K].
 
     Raises:
@@ -133,7 +131,7 @@ def steering_of(folder: Path) -> tuple[int, dict[str, list[float]]]:
         model = jax.tree.map(lambda x, k=seed: x[k], models)
         executor = make_executor(as_arrays(config.options), env.action_size, model)
         measured.append(measure(jax.device_get(walked(executor, jax.random.key(config.seed + seed)))))
-    return config.options.length, {name: [row[name] for row in measured] for name in measured[0]}
+    return config.options.length, {name: np.array([row[name] for row in measured]) for name in measured[0]}
 
 
 def main(args: Sequence[str] | None = None) -> None:
@@ -147,17 +145,12 @@ def main(args: Sequence[str] | None = None) -> None:
             length, measures = steering_of(folder)
             run = "/".join(folder.parts[-2:])
             for name, values in measures.items():
-                row = {"run": run, "seeds": len(values), "length": length, "measure": name}
-                told = {k: f"{v:.{DIGITS}g}" for k, v in with_interval(np.array(values)).items()}
-                rows.append(row | told | {"per_seed": " ".join(f"{x:.{DIGITS}g}" for x in values)})
-                print("  ".join(f"{k} {v}" for k, v in rows[-1].items()))
+                row = {"run": run, "seeds": len(values), "length": length, "measure": name, "per_seed": values}
+                rows.append(row | with_interval(values))
     except (ConfigError, ArtifactError) as error:
         print(f"steering: {error}", file=sys.stderr)
         raise SystemExit(2) from None
-    with arguments.out.open("w", newline="") as file:
-        writer = csv.DictWriter(file, FIELDS, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+    write_numbers(rows, FIELDS, arguments.out)
 
 
 if __name__ == "__main__":

@@ -60,7 +60,7 @@ def execute(
     else:
         first = jax.tree.map(lambda x: jnp.broadcast_to(x[:1], x.shape), begin.env.replace(key=None))
         begin = begin.replace(env=first.replace(key=begin.env.key))
-    chosen = partial(_choose, option)
+    chosen = partial(always, option)
     _, ticks = rollout(env, executor, chosen, begin, key_noise, executor.length)
     last = jnp.argmax(ticks.ended, axis=0)
     size = env.proprioceptive_size
@@ -72,7 +72,8 @@ def _prior(obs: Float[Array, "B S"], noise: Float[Array, "B D"]) -> tuple[Array,
     return noise, jnp.zeros(len(noise))
 
 
-def _choose(option: Float[Array, "B D"], obs: Float[Array, "B S"], noise: Array) -> tuple[Array, Array]:
+def always(option: Float[Array, "B D"], obs: Float[Array, "B S"], noise: Array) -> tuple[Array, Array]:
+    """Decide on these options whatever is observed: with them, a `DecideFn`."""
     return option, jnp.zeros(len(option))
 
 

@@ -253,9 +253,9 @@ def test_figure_6_draws_what_the_table_holds_and_marks_the_rest(table, tmp_path,
 
 def test_figure_8_compares_every_measure_with_both_baselines(table, tmp_path):
     """Options return 10 to 14: more than flat PPO's 0 to 4, less than 20 to 24 of flat PPO from Ant's policy."""
-    levels = {"flat": 0.0, "transfer": 20.0, "closed": 10.0}
+    levels = {"flat": 0.0, "transfer": 20.0, "closed": 10.0, "open": 12.0}
     rows = [made_row("ant_maze", method, 0, 5, level) for method, level in levels.items()]
-    for row, share in zip(rows, (0.0, 1.0, 0.4), strict=True):
+    for row, share in zip(rows, (0.0, 1.0, 0.4, 0.4), strict=True):
         row["numbers"] |= {"final/success": [share] * 4 + [1.0], "final/closest_approach": [share] * 5}
         row["numbers"]["final/upside_down"] = [1 - share] * 5
         row["curves"]["mean/success"] = np.outer([0, 0, 0, 1, 1], np.arange(50) == 20).tolist()
@@ -278,8 +278,9 @@ def test_figure_8_compares_every_measure_with_both_baselines(table, tmp_path):
     }
     assert closed["training/return"]["mean"] == "11.52", "of 12 on average, the last five points of a straight line"
     assert numbers["flat", "last"]["improvement_on_flat"] == "" and closed["last"]["per_seed"] == "10 11 12 13 14"
+    assert closed["last"]["improvement_on_open"] == "0.18", "of the 25 pairs 3 are won and 3 are ties"
     at_goal = {name: numbers[name, "final/success"]["seeds_at_goal"] for name in levels}
-    assert at_goal == {"flat": "1/5", "transfer": "5/5", "closed": "1/5"}
+    assert at_goal == {"flat": "1/5", "transfer": "5/5", "closed": "1/5", "open": "1/5"}
     assert closed["training/success"]["seeds_at_goal"] == "2/5", "at any time, and nothing is left at the end"
     assert closed["last"]["remarks"] == "5 of 10 seeds" and float(closed["last"]["p_holm"]) > 0.9
     assert closed["first"]["p_holm"] == "" and closed["final/success"]["mean"] == "0.52"
