@@ -2,11 +2,14 @@
 
 JAX's own callbacks are baked into a program as an address, so no program with one can be kept in the persistent
 compilation cache. Here a function is a handler of XLA's foreign function interface. Its C structures (those of
-`xla/ffi/api/c_api.h`, extended only at their ends) are read by ctypes, as words: nothing needs to be compiled.
+`xla/ffi/api/c_api.h`, extended only at their ends) are read by ctypes, as words: nothing needs to be compiled. XLA is
+given the version at which they were read and refuses a handler whose version it no longer serves.
 """
 
 import ctypes
+import functools
 import math
+import sys
 from collections.abc import Callable
 
 import jax
@@ -17,12 +20,17 @@ from jaxtyping import Array, Float
 HostFn = Callable[[np.ndarray, np.ndarray], None]
 """Reads its first argument, writes its second; both are float32 and XLA's own memory."""
 
+API_VERSION = (0, 1)
+"""Major and minor version of XLA's interface that the places below belong to. 0.3 still has them; XLA serves both."""
+
 # Places of words in XLA_FFI_CallFrame, XLA_FFI_Api, XLA_FFI_Extension_Base, XLA_FFI_Metadata and XLA_FFI_Buffer.
 _EXTENSION, _API, _ARGUMENTS, _RESULTS = 1, 2, 9, 14
-_VERSION, _CREATE_ERROR = 4, 6
+_CREATE_ERROR = 6
 _EXTENSION_TYPE, _EXTENDED, _METADATA_VERSION = 1, 3, 3
 _DATA, _RANK, _DIMS = 3, 4, 5
 _METADATA, _INTERNAL = 1, 13  # codes of an extension and of an error
+
+_REFUSAL = "a negative number, or another shape"
 
 _Handler = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)
 
@@ -34,6 +42,9 @@ class HostCall:
       name: not used before in this process. Programs in the persistent cache look for it, so it must tell what
         the function does.
       function: what to call, maybe from several threads at once. It must not call JAX, which can deadlock.
+
+    Raises:
+      RuntimeError: XLA no longer serves `API_VERSION`.
     """
 
     def __init__(self, name: str, function: HostFn):
@@ -52,14 +63,52 @@ class HostCall:
         if frame[_EXTENSION]:
             extension = _words(frame[_EXTENSION], _EXTENDED + 1)
             if extension[_EXTENSION_TYPE] & 0xFFFFFFFF == _METADATA:  # asked once, at registration
-                version = _words(frame[_API], _VERSION + 2)[_VERSION]
-                _words(extension[_EXTENDED], _METADATA_VERSION + 1)[_METADATA_VERSION] = version
+                major, minor = API_VERSION
+                _words(extension[_EXTENDED], _METADATA_VERSION + 1)[_METADATA_VERSION] = major | minor << 32
                 return None
         try:
             self._function(_array(frame[_ARGUMENTS]), _array(frame[_RESULTS]))
         except Exception as error:  # raised here it would only be printed
             return _as_error(frame[_API], f"{type(error).__name__}: {error}")
         return None
+
+
+@functools.cache
+def host_calls_work() -> bool:
+    """Return whether XLA calls the host as this module expects, by one call of known answer and one that must fail.
+
+    Where it does not, say so in one line on standard error. A process without a CPU device has no use for host calls.
+    """
+    try:
+        (cpu, *_), argument = jax.local_devices(backend="cpu"), np.arange(6, dtype=np.float32).reshape(2, 3)
+        with jax.ensure_compile_time_eval(), jax.default_device(cpu):
+            call = jax.jit(functools.partial(HostCall("taic_jax_probe", _answer), size=2))
+            if np.array_equal(call(argument), [[1, 3], [7, 9]]) and _fails(call, np.full_like(argument, -1)):
+                return True
+        reason = "a call of known answer went wrong"
+    except (RuntimeError, ValueError) as error:
+        reason = str(error).splitlines()[0]
+    print(
+        f"taic_jax: warning: this version of XLA does not call the physics directly ({reason}); "
+        "it goes through jax.pure_callback, which is slower, and programs with physics are compiled at every start",
+        file=sys.stderr,
+    )
+    return False
+
+
+def _answer(argument: np.ndarray, result: np.ndarray) -> None:
+    """Return twice the first two of three columns, plus one; refuse negative numbers."""
+    if argument.shape != (2, 3) or argument.min() < 0:
+        raise ValueError(_REFUSAL)
+    result[...] = 2 * argument[:, :2] + 1
+
+
+def _fails(call: Callable[[np.ndarray], jax.Array], argument: np.ndarray) -> bool:
+    try:
+        jax.block_until_ready(call(argument))
+    except Exception as error:  # its type differs between versions of JAX
+        return _REFUSAL in str(error)
+    return False
 
 
 def _words(address: int, count: int) -> "ctypes.Array[ctypes.c_int64]":
