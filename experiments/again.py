@@ -17,12 +17,12 @@ import numpy as np
 import tyro
 from scipy import stats
 
+from taic_jax.analysis.statistics import exact_interval
 from taic_jax.experiments.drawing import RESULTS
 from taic_jax.experiments.figure5c import recovered
 from taic_jax.experiments.figure7 import with_interval, write_numbers
 from taic_jax.experiments.spaces import PREFIX
 from taic_jax.experiments.table import TABLE, Runs, TableError, read_table, select
-from taic_jax.statistics import exact_interval
 
 # What the figures show of a row, where it has it: heading, and the number per seed.
 MEASURES = {

@@ -16,9 +16,9 @@ import tyro
 from matplotlib.axes import Axes
 from PIL import Image
 
+from taic_jax.analysis.statistics import iqm
 from taic_jax.config_io import load_config
 from taic_jax.logging import read_metrics
-from taic_jax.statistics import iqm
 
 COLOURS = {"flat": "#7f7f7f", "taic": "#d1495b"}
 LABELS = {"flat": "flat PPO", "taic": "options (TAIC)"}

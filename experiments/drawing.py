@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from PIL import Image
 
-from taic_jax.statistics import iqm, stratified_interval
+from taic_jax.analysis.statistics import iqm, stratified_interval
 
 # Okabe and Ito's palette, which readers who confuse colours can tell apart.
 GREY, BLACK, ORANGE, SKY, GREEN, BLUE, RED, PINK = (

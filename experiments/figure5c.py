@@ -16,12 +16,12 @@ import numpy as np
 import tyro
 from scipy import stats
 
+from taic_jax.analysis.statistics import exact_interval
 from taic_jax.experiments.cells import RECOVERING, RECOVERY
 from taic_jax.experiments.drawing import BLACK, RED, RESULTS, mark, plt, save, styled
 from taic_jax.experiments.figure7 import write_numbers
 from taic_jax.experiments.recovery import AFTER, RECOVERED
 from taic_jax.experiments.table import TABLE, Runs, TableError, read_table, select
-from taic_jax.statistics import exact_interval
 
 SEEDS = 50
 BEFORE = 80_000

@@ -16,6 +16,7 @@ import numpy as np
 import tyro
 from scipy import stats
 
+from taic_jax.analysis.statistics import bootstrap_interval, holm, iqm, probability_of_improvement
 from taic_jax.experiments.cells import METHODS, ROBOTS
 from taic_jax.experiments.drawing import (
     BLACK,
@@ -40,7 +41,6 @@ from taic_jax.experiments.drawing import (
     styled,
 )  # fmt: skip
 from taic_jax.experiments.table import DIGITS, TABLE, Runs, TableError, read_table, select
-from taic_jax.statistics import bootstrap_interval, holm, iqm, probability_of_improvement
 
 COLOURS = dict(zip(METHODS, (BLACK, OLIVE, GREY, PINK, SKY, ORANGE, BLUE, GREEN, RED, PURPLE), strict=True))
 BASELINE = "strong"

@@ -17,6 +17,7 @@ import numpy as np
 import tyro
 from scipy import stats
 
+from taic_jax.analysis.statistics import probability_of_improvement
 from taic_jax.experiments.cells import TRANSFERRED, TRANSFERS
 from taic_jax.experiments.drawing import (
     BLACK,
@@ -37,7 +38,6 @@ from taic_jax.experiments.drawing import (
 )
 from taic_jax.experiments.figure7 import make_figure, with_interval
 from taic_jax.experiments.table import TABLE, Runs
-from taic_jax.statistics import probability_of_improvement
 
 SEEDS = 10
 COLOURS = {"open": ORANGE, "closed": RED, "tuned": PURPLE, "flat": BLACK, "transfer": BLUE}

@@ -13,13 +13,13 @@ from pathlib import Path
 import numpy as np
 import tyro
 
+from taic_jax.analysis.statistics import probability_of_improvement
 from taic_jax.experiments.cells import FLAT, METHODS, OTHERS, ROBOTS
 from taic_jax.experiments.drawing import RESULTS
 from taic_jax.experiments.figure7 import BASELINE, read_methods, with_interval
 from taic_jax.experiments.spaces import PREFIX
 from taic_jax.experiments.table import TABLE, Runs, TableError, read_table
 from taic_jax.files import save_text
-from taic_jax.statistics import probability_of_improvement
 
 # Heading, and the number per seed that stands below it.
 COLUMNS = {

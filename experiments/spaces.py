@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from taic_jax import option_space
+from taic_jax.analysis import option_space
 from taic_jax.artifacts import load_options
 from taic_jax.config import COLLECT
 from taic_jax.config_io import load_config

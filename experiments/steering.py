@@ -19,6 +19,7 @@ import numpy as np
 import tyro
 from jaxtyping import Array, Float, Key
 
+from taic_jax.analysis.option_space import always
 from taic_jax.artifacts import load_options
 from taic_jax.checkpoint import ArtifactError
 from taic_jax.config import ConfigError
@@ -28,7 +29,6 @@ from taic_jax.envs.base import Env, State
 from taic_jax.envs.wrappers import AutoReset, Wrapper
 from taic_jax.experiments.drawing import RESULTS
 from taic_jax.experiments.figure7 import with_interval, write_numbers
-from taic_jax.option_space import always
 from taic_jax.options.execution import Executor, make_executor
 from taic_jax.rl.rollout import Running, rollout, start
 from taic_jax.tasks import make_envs

@@ -1,47 +1,59 @@
 """Temporal abstraction with information-theoretic constraints, trained end to end in JAX.
 
 The names below are the whole public surface. They are imported on first use, so that the command line can answer
-before JAX is loaded.
+before JAX is loaded. None is the name of a module too: to import that module would put it in the name's place.
 """
 
 import importlib
 from typing import TYPE_CHECKING, Any
 
+__version__ = "0.1.0"
+
 if TYPE_CHECKING:
-    from taic_jax.config import CollectConfig, Config, EnvConfig, EvaluateConfig, OptionsConfig, PPOConfig, TrainConfig
+    from taic_jax.analysis.evaluate import evaluate, record
+    from taic_jax.analysis.measures import measure_option_space
+    from taic_jax.analysis.statistics import bootstrap_interval, iqm
+    from taic_jax.config import (
+        CollectConfig,
+        Config,
+        EnvConfig,
+        EvaluateConfig,
+        FineTuneConfig,
+        OptionsConfig,
+        PPOConfig,
+        TrainConfig,
+    )
     from taic_jax.config_io import load_config
     from taic_jax.envs import AutoReset, Env, State, environment_names, make_env
-    from taic_jax.evaluate import evaluate, record
     from taic_jax.experience import collect
-    from taic_jax.measures import measure_option_space
     from taic_jax.options.dataset import Experience
     from taic_jax.options.execution import Executor, IdentityExecutor, OptionExecutor, make_executor
     from taic_jax.options.learning import learn
     from taic_jax.options.model import OptionModel
     from taic_jax.pipeline import run_pipeline
     from taic_jax.rl.ppo import Agent, train
-    from taic_jax.statistics import bootstrap_interval, iqm
 
 _MODULES = {
+    "analysis.evaluate": ("evaluate", "record"),
+    "analysis.measures": ("measure_option_space",),
+    "analysis.statistics": ("bootstrap_interval", "iqm"),
     "config": (
-        "CollectConfig", "Config", "EnvConfig", "EvaluateConfig", "OptionsConfig", "PPOConfig", "TrainConfig",
+        "CollectConfig", "Config", "EnvConfig", "EvaluateConfig", "FineTuneConfig", "OptionsConfig", "PPOConfig",
+        "TrainConfig",
     ),
     "config_io": ("load_config",),
     "envs": ("AutoReset", "Env", "State", "environment_names", "make_env"),
-    "evaluate": ("evaluate", "record"),
     "experience": ("collect",),
-    "measures": ("measure_option_space",),
     "options.dataset": ("Experience",),
     "options.execution": ("Executor", "IdentityExecutor", "OptionExecutor", "make_executor"),
     "options.learning": ("learn",),
     "options.model": ("OptionModel",),
     "pipeline": ("run_pipeline",),
     "rl.ppo": ("Agent", "train"),
-    "statistics": ("bootstrap_interval", "iqm"),
 }  # fmt: skip
 _HOME = {name: module for module, names in _MODULES.items() for name in names}
 
-__all__ = sorted(_HOME)  # pyright: ignore[reportUnsupportedDunderAll]
+__all__ = sorted(["__version__", *_HOME])  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __getattr__(name: str) -> Any:

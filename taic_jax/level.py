@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from taic_jax.analysis.evaluate import evaluate
 from taic_jax.config import FineTuneConfig, PPOConfig
 from taic_jax.envs.base import Env
-from taic_jax.evaluate import evaluate
 from taic_jax.experience import as_experience
 from taic_jax.options.dataset import Experience
 from taic_jax.options.execution import Executor

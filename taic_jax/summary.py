@@ -9,15 +9,15 @@ from typing import Any
 import jax
 import numpy as np
 
+from taic_jax.analysis.evaluate import record
+from taic_jax.analysis.statistics import summarize
 from taic_jax.config import COLLECT, Config, collector_is_baseline, needs_collect
 from taic_jax.envs.base import Env
-from taic_jax.evaluate import record
 from taic_jax.experience import experience_bytes
 from taic_jax.files import whole_file, writes_here
 from taic_jax.guard import FINITE, QUANTITIES
 from taic_jax.rl.ppo import Agent, num_iterations
 from taic_jax.stage import Run, Stopped
-from taic_jax.statistics import summarize
 
 PACKAGES = ("taic_jax", "jax", "jaxlib", "flax", "optax", "brax", "mujoco", "mujoco-mjx", "orbax-checkpoint")
 MIB = 2**20

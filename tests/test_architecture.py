@@ -7,10 +7,9 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
+FOLDERS = ("envs", "experiments", *(f"taic_jax/{name}" for name in ("analysis", "options", "report", "rl", "sweep")))
 PACKAGE = sorted((ROOT / "taic_jax").glob("*.py")) + sorted(
-    path
-    for folder in ("envs", "experiments", "taic_jax/options", "taic_jax/report", "taic_jax/rl", "taic_jax/sweep")
-    for path in (ROOT / folder).rglob("*.py")
+    path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py")
 )
 ALL = PACKAGE + sorted((ROOT / "tests").rglob("*.py"))
 
@@ -21,7 +20,7 @@ LAYERS = (
     "networks normalize returns guard",
     "options",
     "rl",
-    "experience evaluate statistics artifacts demonstrations measures option_space",
+    "experience artifacts demonstrations analysis",
     "logging interruption level population",
     "stage summary tasks",
     "pipeline",

@@ -8,8 +8,8 @@ import numpy as np
 from probes import Counting, Probe, Repeat
 
 from taic_jax import normalize
+from taic_jax.analysis.evaluate import evaluate, record
 from taic_jax.config import PPOConfig
-from taic_jax.evaluate import evaluate, record
 from taic_jax.rl import ppo
 
 END, EPISODES = 6, 100

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.distance import pdist, squareform
 from scipy.stats import ortho_group
 
-from taic_jax import measures
+from taic_jax.analysis import measures
 from taic_jax.options.losses import kl_loss
 
 ROWS = 600

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from probes import NO, Counting, Probe, Repeat
 
+from taic_jax.analysis.option_space import WARM_UP, encode_windows, execute, measure, order
 from taic_jax.config import OptionsConfig
-from taic_jax.option_space import WARM_UP, encode_windows, execute, measure, order
 from taic_jax.options.dataset import Experience
 from taic_jax.options.learning import learn
 

@@ -8,11 +8,11 @@ import pytest
 from tiny_runs import CONFIG, with_fields
 from written_runs import method, rows, write_options, write_run
 
+from taic_jax.analysis.statistics import bootstrap_interval
 from taic_jax.report.__main__ import main
 from taic_jax.report.curves import thinned
 from taic_jax.report.option_plots import principal_plane
 from taic_jax.report.page import GENERATOR, Detail, collect, render
-from taic_jax.statistics import bootstrap_interval
 
 NO_PLOTS = Detail(options=0)
 

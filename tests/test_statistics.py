@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from taic_jax.statistics import (
+from taic_jax.analysis.statistics import (
     bootstrap_interval,
     exact_interval,
     holm,

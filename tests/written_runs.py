@@ -9,6 +9,7 @@ import numpy as np
 from PIL import Image
 from tiny_runs import CONFIG
 
+from taic_jax.analysis.statistics import summarize
 from taic_jax.artifacts import OPTIONS, describe, save_options
 from taic_jax.config import Config
 from taic_jax.config_io import to_yaml
@@ -17,7 +18,6 @@ from taic_jax.experience import EXPERIENCE, ExperienceStore
 from taic_jax.experiments.table import append_row
 from taic_jax.options.dataset import Experience
 from taic_jax.options.model import OptionModel, Scale, init_params, make_networks
-from taic_jax.statistics import summarize
 
 SEEDS = (1.0, 3.0)
 TICKS = 1000

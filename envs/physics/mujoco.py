@@ -78,7 +78,7 @@ class MujocoPhysics(Physics):
         return self.engine.call(sent, self.engine.num_returned)
 
     def _step_elsewhere(self, sent: Float[Array, " n"]) -> Float[Array, " m"]:
-        """Step simulations whose state comes from an accelerator, or through an XLA that takes no host calls of ours."""
+        """Step simulations whose state comes from an accelerator, or where XLA refuses our host calls."""
         shape = jax.ShapeDtypeStruct((self.engine.num_returned,), jnp.float32)
         return jax.pure_callback(self.engine.copied_step, shape, sent, vmap_method="broadcast_all")
 

@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
+from taic_jax.analysis.statistics import bootstrap_interval, iqm
 from taic_jax.config import COLLECT
 from taic_jax.report.runs import ReportError, RunData, per_seed, read_run
-from taic_jax.statistics import bootstrap_interval, iqm
 
 DIGITS = 5
 """Significant digits of what is drawn."""

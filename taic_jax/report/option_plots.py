@@ -9,13 +9,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from taic_jax.analysis.option_space import encode_windows
 from taic_jax.artifacts import OPTIONS, Body, described_body, load_options
 from taic_jax.checkpoint import ArtifactError
 from taic_jax.config import COLLECT, ConfigError, OptionsConfig
 from taic_jax.config_io import load_config
 from taic_jax.experience import gather_experience
 from taic_jax.networks import apply
-from taic_jax.option_space import encode_windows
 from taic_jax.options.dataset import Experience
 from taic_jax.options.model import OptionModel, make_networks
 from taic_jax.report.curves import rounded

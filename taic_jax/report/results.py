@@ -4,10 +4,10 @@ from typing import Any
 
 import numpy as np
 
+from taic_jax.analysis.statistics import summarize
 from taic_jax.config import COLLECT
 from taic_jax.report.curves import label_of, pretraining
 from taic_jax.report.runs import UNTRAINED_STAGES, RunData, per_seed
-from taic_jax.statistics import summarize
 
 MODES = ("return", "return_mean_option")
 """Returns of the policy as it explores, and of its mean options."""

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from taic_jax.analysis.statistics import bootstrap_interval, iqm
 from taic_jax.config import Config, replace
 from taic_jax.config_io import to_yaml
 from taic_jax.experience import EXPERIENCE
@@ -22,7 +23,6 @@ from taic_jax.logging import read_metrics
 from taic_jax.pipeline import run_pipeline
 from taic_jax.population import Population, schedule
 from taic_jax.run_folder import RunFolderError, claimed, prepare_folder
-from taic_jax.statistics import bootstrap_interval, iqm
 from taic_jax.sweep.axes import Axis, chunks, configs_of, show
 from taic_jax.sweep.marginals import draw_marginals
 

@@ -9,16 +9,16 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, Key
 
-from taic_jax.config import OptionsConfig
-from taic_jax.envs.base import Env
-from taic_jax.envs.wrappers import AutoReset
-from taic_jax.measures import (
+from taic_jax.analysis.measures import (
     active_dimensions,
     distance_correlation,
     kl_per_dimension,
     measure_option_space,
     standardized,
 )
+from taic_jax.config import OptionsConfig
+from taic_jax.envs.base import Env
+from taic_jax.envs.wrappers import AutoReset
 from taic_jax.networks import apply
 from taic_jax.options.dataset import Experience, gather, make_dataset
 from taic_jax.options.execution import Executor, make_executor
