@@ -8,6 +8,7 @@ import dataclasses
 import difflib
 import io
 import math
+import os
 import re
 import sys
 import zlib
@@ -55,6 +56,8 @@ def main(args: Sequence[str] | None = None) -> int:
     """Draw, and return the exit code: 0, or 2 where the arguments or this machine do not allow it."""
     try:
         draw(parse(sys.argv[1:] if args is None else args))
+    except BrokenPipeError:  # the reader, such as head, has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except (ValueError, OSError, RenderingError) as error:
         ours = type(error).__module__.partition(".")[0] in ("taic_jax", __name__)
         if not ours and not isinstance(error, OSError):
@@ -79,8 +82,9 @@ def parse(args: Sequence[str]) -> Arguments:
         known = ["--" + field.name.replace("_", "-") for field in dataclasses.fields(Arguments)]
         for option in (arg.partition("=")[0] for arg in args if arg.startswith("--")):
             if option.replace("_", "-") not in known:
-                nearest = difflib.get_close_matches(option, known, n=1, cutoff=0.0)[0]
-                raise ArgumentError(f"unknown option {option}; the nearest is {nearest}") from None
+                near = difflib.get_close_matches(option, known, n=1)
+                hint = f"the nearest is {near[0]}" if near else f"there are {', '.join(known)}"
+                raise ArgumentError(f"unknown option {option}; {hint}") from None
         raise ArgumentError(f"expected {', '.join(known)} with their values, got {' '.join(args)!r}") from None
     if arguments.ticks < 1:
         raise ArgumentError(f"--ticks: expected at least 1, got {arguments.ticks}; the nearest valid value is 1")

@@ -9,7 +9,7 @@ class UnknownNameError(ValueError):
 
     def __init__(self, kind: str, given: str, valid: Iterable[str]):
         valid = list(valid)
-        nearest = difflib.get_close_matches(given, valid, n=1, cutoff=0.0)
+        nearest = difflib.get_close_matches(given, valid, n=1, cutoff=0.5)
         hint = f"did you mean {nearest[0]!r}? " if nearest else ""
         super().__init__(f"unknown {kind} {given!r}: {hint}valid: {', '.join(valid)}")
 

@@ -18,6 +18,7 @@ import tyro
 from scipy import stats
 
 from taic_jax.analysis.statistics import exact_interval
+from taic_jax.command_line import tell
 from taic_jax.experiments.drawing import RESULTS
 from taic_jax.experiments.figure5c import recovered
 from taic_jax.experiments.figure7 import with_interval, write_numbers
@@ -107,4 +108,4 @@ def main(args: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(tell(main))

@@ -4,7 +4,7 @@ import dataclasses
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from taic_jax.config import CollectConfig, Config, EvaluateConfig, FineTuneConfig, OptionsConfig, PPOConfig
+from taic_jax.config import CollectConfig, Config, EvaluateConfig, FineTuneConfig, OptionsConfig, PPOConfig, replace
 from taic_jax.config_io import load_config
 
 ROBOTS = ("half_cheetah", "ant", "hopper", "walker2d")
@@ -13,6 +13,8 @@ RECOVERY = "nav2d"
 # Interactions with the task; flat PPO of method long has twice as many.
 TICKS = {"ant": 2_000_000} | dict.fromkeys(TRANSFERS, 3_000_000)
 MILLION = 1_000_000
+CAPACITY = MILLION
+"""Ticks of experience kept: of Ant's two million the second half, which all windows there are of."""
 FIRST_SEED = 200
 PATHS = "paths"
 """Method of the row that holds what options of the room draw."""
@@ -98,7 +100,7 @@ def flat_config(task: str, strength: str, seed: int, seeds: int) -> Config:
     ppo = load_config("paper").collect.ppo if strength == "weak" else config.collect.ppo
     return dataclasses.replace(
         config,
-        collect=CollectConfig(ticks=2 * ticks if strength == "long" else ticks, capacity=MILLION, ppo=ppo),
+        collect=CollectConfig(ticks=2 * ticks if strength == "long" else ticks, ppo=ppo),
         options=OptionsConfig(),  # what differs is told below; no preset may change it
         train=dataclasses.replace(
             config.train, ticks=ticks, baselines=(), ppo=like_flat(config), fine_tune=FineTuneConfig()
@@ -223,4 +225,4 @@ def all_cells(run_dir: Path) -> list[Cell]:
         cells += robots(task, run_dir)
     for task in TRANSFERS:
         cells += [cell for cell in transfers(task, run_dir) if cell.name not in {known.name for known in cells}]
-    return cells
+    return [cell._replace(config=replace(cell.config, "collect.capacity", CAPACITY)) for cell in cells]

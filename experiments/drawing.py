@@ -23,7 +23,7 @@ GREY, BLACK, ORANGE, SKY, GREEN, BLUE, RED, PINK = (
 OLIVE, PURPLE = "#a89b00", "#6a1b9a"
 WARNING = "#b00020"
 RESULTS = Path("experiments/results")
-LEGEND = "curves: while training; dots: evaluated after it"
+LEGEND = "curves: while training, with its noise; dots: after training, mean actions or mean options, without noise"
 """Title of the legend where `draw_curves` and `draw_end` draw."""
 
 styled = plt.rc_context({
@@ -46,7 +46,7 @@ def draw_curves(
 
 
 def draw_end(axes: Axes, tick: int | np.integer, values: np.ndarray, colour: str) -> None:
-    """Draw a dot at the interquartile mean of what each seed [K] returns when it is evaluated after training."""
+    """Draw a dot at the interquartile mean of what the mean actions or mean options of each seed [K] return."""
     axes.plot(tick, iqm(values), "o", color=colour, markeredgecolor="white", markersize=7, zorder=4)
 
 

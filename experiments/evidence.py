@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import tyro
 
 from taic_jax.checkpoint import ArtifactError
+from taic_jax.command_line import tell
 from taic_jax.compilation import keep_programs
 from taic_jax.config import ConfigError, Shard
 from taic_jax.devices import Devices, make_devices, open_devices
@@ -180,4 +181,4 @@ def show(cells: Sequence[Cell], rows: dict[tuple[str, str, int], dict[str, Any]]
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(tell(main))

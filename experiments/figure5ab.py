@@ -17,6 +17,7 @@ import numpy as np
 import tyro
 from matplotlib.axes import Axes
 
+from taic_jax.command_line import tell
 from taic_jax.experiments.cells import PATHS, RECOVERY
 from taic_jax.experiments.drawing import BLUE, GREY, RED, RESULTS, mark, plt, save, styled
 from taic_jax.experiments.figure7 import with_interval, write_numbers
@@ -101,4 +102,4 @@ def main(args: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(tell(main))

@@ -17,6 +17,7 @@ import tyro
 from scipy import stats
 
 from taic_jax.analysis.statistics import exact_interval
+from taic_jax.command_line import tell
 from taic_jax.experiments.cells import RECOVERING, RECOVERY
 from taic_jax.experiments.drawing import BLACK, RED, RESULTS, mark, plt, save, styled
 from taic_jax.experiments.figure7 import write_numbers
@@ -122,4 +123,4 @@ def main(args: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(tell(main))

@@ -18,6 +18,7 @@ import tyro
 from jaxtyping import Float
 from matplotlib.axes import Axes
 
+from taic_jax.command_line import tell
 from taic_jax.experiments.cells import METHODS, OTHERS, SPACES
 from taic_jax.experiments.drawing import BLUE, GREY, RESULTS, mark, plt, save, styled
 from taic_jax.experiments.figure7 import with_interval, write_numbers
@@ -133,4 +134,4 @@ def main(args: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(tell(main))

@@ -1,6 +1,8 @@
 """Figure 7: learning curves of options and of flat PPO on the robots, and the numbers of claim C2.
 
 python -m taic_jax.experiments.figure7
+python -m taic_jax.experiments.figure7 --methods strong long fixed-closed-both-tuned \
+    --out experiments/results/returns.png
 
 Reads the table alone. A method with fewer seeds than it needs is marked on its panel, as is what is missing.
 """
@@ -17,6 +19,7 @@ import tyro
 from scipy import stats
 
 from taic_jax.analysis.statistics import bootstrap_interval, holm, iqm, probability_of_improvement
+from taic_jax.command_line import tell
 from taic_jax.experiments.cells import METHODS, ROBOTS
 from taic_jax.experiments.drawing import (
     BLACK,
@@ -48,8 +51,10 @@ FIELDS = (
     "task", "method", "seeds", "ticks", "pretraining", "iqm", "low", "high", "auc", "auc_low", "auc_high",
     "jump_start", "jump_starts_positive", "ticks_to_threshold", "reached", "improvement", "improvement_low",
     "improvement_high", "p_holm", "improvement_on_weak", "improvement_at_same_total", "mean", "improvement_of_means",
-    "improvement_of_means_at_same_total", "remarks",
+    "improvement_of_means_low", "improvement_of_means_high", "improvement_of_means_at_same_total",
+    "improvement_of_means_at_same_total_low", "improvement_of_means_at_same_total_high", "remarks",
 )  # fmt: skip
+BOUNDS = ("", "_low", "_high")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,6 +67,8 @@ class Arguments:
     """The picture; its numbers are written beside it as CSV."""
     tasks: tuple[str, ...] = ROBOTS
     """Panels."""
+    methods: tuple[str, ...] = tuple(METHODS)
+    """Curves."""
 
 
 def read_methods(
@@ -109,7 +116,8 @@ def numbers(runs: Runs, methods: dict[str, Runs]) -> list[dict[str, Any]]:
         p, interval = probability_of_improvement(last, flat.numbers["last"])
         row |= dict(zip(("improvement", "improvement_low", "improvement_high"), (p, *interval), strict=True))
         means = [each.numbers["mean_option"] for each in (runs, flat)]
-        row["improvement_of_means"] = probability_of_improvement(*means)[0]
+        p, interval = probability_of_improvement(*means)
+        row |= {f"improvement_of_means{k}": v for k, v in zip(BOUNDS, (p, *interval), strict=True)}
         row["p"] = float(stats.mannwhitneyu(last, flat.numbers["last"], alternative="greater").pvalue)
     if "weak" in methods and runs.method not in (BASELINE, "weak"):
         row["improvement_on_weak"] = probability_of_improvement(last, methods["weak"].numbers["last"])[0]
@@ -117,7 +125,8 @@ def numbers(runs: Runs, methods: dict[str, Runs]) -> list[dict[str, Any]]:
     if long is not None and runs.pretraining and runs.pretraining + runs.ticks == long.ticks:
         row["improvement_at_same_total"] = probability_of_improvement(last, long.numbers["last"])[0]
         means = [each.numbers["mean_option"] for each in (runs, long)]
-        row["improvement_of_means_at_same_total"] = probability_of_improvement(*means)[0]
+        p, interval = probability_of_improvement(*means)
+        row |= {f"improvement_of_means_at_same_total{k}": v for k, v in zip(BOUNDS, (p, *interval), strict=True)}
     return [row]
 
 
@@ -139,7 +148,7 @@ def draw(found: dict[str, tuple[dict[str, Runs], list[str]]], out: Path) -> None
                 shift = runs.pretraining if row else 0
                 flat = "-" not in method
                 draw_curves(axes, runs.grid + shift, runs.curves["return"], COLOURS[method], METHODS[method][0], flat)
-                draw_end(axes, runs.grid[-1] + shift, runs.numbers["last"], COLOURS[method])
+                draw_end(axes, runs.grid[-1] + shift, runs.numbers["mean_option"], COLOURS[method])
             if not methods:
                 empty(axes)
                 continue
@@ -206,8 +215,11 @@ def make_figure(
 
 def main(args: Sequence[str] | None = None) -> None:
     """Draw figure 7 and write its numbers."""
-    make_figure("7", tyro.cli(Arguments, args=args), METHODS, draw, numbers, FIELDS)
+    arguments = tyro.cli(Arguments, args=args)
+    if unknown := set(arguments.methods) - set(METHODS):
+        raise TableError(f"--methods: expected some of {', '.join(METHODS)}, got {min(unknown)}")
+    make_figure("7", arguments, {name: METHODS[name] for name in arguments.methods}, draw, numbers, FIELDS)
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(tell(main))

@@ -9,6 +9,7 @@ one of a baseline, or of options in open loop.
 """
 
 import dataclasses
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ import tyro
 from scipy import stats
 
 from taic_jax.analysis.statistics import probability_of_improvement
+from taic_jax.command_line import tell
 from taic_jax.experiments.cells import TRANSFERRED, TRANSFERS
 from taic_jax.experiments.drawing import (
     BLACK,
@@ -36,7 +38,7 @@ from taic_jax.experiments.drawing import (
     save,
     styled,
 )
-from taic_jax.experiments.figure7 import make_figure, with_interval
+from taic_jax.experiments.figure7 import BOUNDS, make_figure, with_interval
 from taic_jax.experiments.table import TABLE, Runs
 
 SEEDS = 10
@@ -49,7 +51,7 @@ CURVES = {"return": "training/return", "mean/success": "training/success"}
 LOWER = ("final/closest_approach", "final/upside_down")
 """Measures of which less is better."""
 COMPARED = (*BASELINES, "open")
-BOUNDS = ("", "_low", "_high")
+
 FIELDS = (
     "task", "method", "measure", "seeds", "ticks", "iqm", "low", "high", "mean",
     *(f"improvement_on_{name}{bound}" for name in COMPARED for bound in BOUNDS),
@@ -121,7 +123,7 @@ def draw(found: dict[str, tuple[dict[str, Runs], list[str]]], out: Path) -> None
                     axes, runs.grid, runs.curves[name], COLOURS[method], TRANSFERRED[method][0], method in BASELINES
                 )
                 if name == "return":
-                    draw_end(axes, runs.grid[-1], runs.numbers["last"], COLOURS[method])
+                    draw_end(axes, runs.grid[-1], runs.numbers["mean_option"], COLOURS[method])
             if held:
                 axes.set_xlim(left=0)
                 interactions(axes, "interactions with the task")
@@ -147,4 +149,4 @@ def main(args: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(tell(main))

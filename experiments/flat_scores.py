@@ -8,6 +8,7 @@ goes on from its last checkpoint.
 
 import csv
 import dataclasses
+import sys
 from pathlib import Path
 
 import jax
@@ -16,6 +17,7 @@ import numpy as np
 import tyro
 
 from taic_jax.analysis.statistics import bootstrap_interval, iqm
+from taic_jax.command_line import tell
 from taic_jax.config import CollectConfig, Config, EnvConfig, EvaluateConfig, PPOConfig, TrainConfig
 from taic_jax.logging import RunLogger
 from taic_jax.pipeline import train_baseline
@@ -125,4 +127,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(tell(main))

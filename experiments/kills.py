@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 import tyro
 
+from taic_jax.command_line import tell
 from taic_jax.config import CollectConfig, Config, EnvConfig, EvaluateConfig, OptionsConfig, PPOConfig, TrainConfig
 from taic_jax.config_io import to_yaml
 from taic_jax.logging import read_metrics
@@ -170,4 +171,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(tell(main))

@@ -22,6 +22,7 @@ import tyro
 
 from taic_jax.analysis import option_space
 from taic_jax.analysis.evaluate import evaluate
+from taic_jax.command_line import tell
 from taic_jax.config import Config, ConfigError, walk
 from taic_jax.config_io import load_config
 from taic_jax.envs.base import Env
@@ -143,4 +144,4 @@ def main(args: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(tell(main))

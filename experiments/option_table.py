@@ -14,6 +14,7 @@ import numpy as np
 import tyro
 
 from taic_jax.analysis.statistics import probability_of_improvement
+from taic_jax.command_line import tell
 from taic_jax.experiments.cells import FLAT, METHODS, OTHERS, ROBOTS
 from taic_jax.experiments.drawing import RESULTS
 from taic_jax.experiments.figure7 import BASELINE, read_methods, with_interval
@@ -110,4 +111,4 @@ def main(args: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(tell(main))

@@ -22,6 +22,7 @@ from jaxtyping import Array, Float, Key
 from taic_jax.analysis.option_space import always
 from taic_jax.artifacts import load_options
 from taic_jax.checkpoint import ArtifactError
+from taic_jax.command_line import tell
 from taic_jax.config import ConfigError
 from taic_jax.config_io import load_config
 from taic_jax.envs.ant_tasks import upside_down
@@ -154,4 +155,4 @@ def main(args: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(tell(main))

@@ -23,6 +23,8 @@ TABLE = Path("experiments/results/evidence.jsonl")
 GRID = 50
 """Points of a curve, equally far apart; the last is the end of training."""
 DIGITS = 5
+EARLIER_DEFAULTS = {"collect.capacity": 1_000_000}
+"""Of fields whose default has changed since the first row."""
 OWN = ("seed", "seeds")
 """Fields that say which seeds a run has, and not what is run."""
 
@@ -49,10 +51,11 @@ class Runs:
 def difference(config: Config, run_dir: Path) -> dict[str, Any]:
     """Return the fields that are not the default, without the seeds; what is taken from others is named in `run_dir`.
 
-    A field that a later version adds is at its default, and so leaves the hash of an earlier run as it was. The runs
+    A field that a later version adds is at its default, and so leaves the hash of an earlier run as it was; one whose
+    default was changed is compared with the earlier one. The runs
     of other seeds take theirs from the runs of those seeds: their names differ in the seed alone, which is left out.
     """
-    default = dict(walk(Config()))
+    default = dict(walk(Config())) | EARLIER_DEFAULTS
     fields = {name: value for name, value in walk(config) if name not in OWN and value != default[name]}
 
     def named(text: str) -> str:

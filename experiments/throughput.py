@@ -18,6 +18,7 @@ import numpy as np
 import tyro
 
 from taic_jax import envs
+from taic_jax.command_line import tell
 from taic_jax.compilation import keep_programs
 from taic_jax.config import ConfigError, OptionsConfig, PPOConfig
 from taic_jax.config_io import load_config, preset_names
@@ -258,7 +259,12 @@ def show(figures: dict[str, Any]) -> None:
             for x, form in zip(numbers, ("{:,.0f}", "{:.2f}", "{:.2f}", "{:.1f} s"), strict=True)
         ]
         print(f"{name:32} {texts[0]:>12} {texts[1]:>10} {texts[2]:>8} {texts[3]:>11}   {told['remark']}".rstrip())
-    print("share of an iteration:", ", ".join(f"{name} {share:.0%}" for name, share in figures["shares"].items()))
+    print("share of an iteration:", ", ".join(share_text(*share) for share in figures["shares"].items()))
+
+
+def share_text(name: str, share: float) -> str:
+    """Return the share of a part, a difference of two loops, which noise may make less than nothing."""
+    return f"{name} {share:.0%}" if share >= 0 else f"{name} too little to be told from noise"
 
 
 def show_sweep(told: dict[str, int | float]) -> None:
@@ -288,4 +294,4 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(tell(main))

@@ -7,6 +7,7 @@ python -m taic_jax.experiments.worlds --soak --length 1000
 
 import dataclasses
 import json
+import sys
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -18,6 +19,7 @@ import numpy as np
 import tyro
 
 from taic_jax import envs
+from taic_jax.command_line import tell
 from taic_jax.compilation import keep_programs
 from taic_jax.envs.arenas import outside
 from taic_jax.envs.physics.mjx import MjxPhysics
@@ -185,4 +187,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(tell(main))

@@ -19,8 +19,9 @@ from typing import Annotated, Any, TypeVar, get_type_hints
 
 import tyro
 
+from taic_jax import __version__
 from taic_jax.config import Config, ConfigError, Shard, walk
-from taic_jax.config_io import closest, load_config, mistyped, preset_names
+from taic_jax.config_io import as_integer, load_config, mistyped, nearest, preset_names
 from taic_jax.files import SaveError
 from taic_jax.interruption import DivergedError, Interrupted, Signals
 from taic_jax.validation import validate
@@ -43,7 +44,11 @@ class Command:
     overwrite: tyro.conf.FlagCreatePairsOff[bool] = False
     """Replace the run in --run-dir."""
     dry_run: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Print the configuration and the plan, and stop."""
+    """Refuse what the run would refuse, print the configuration and the plan, and stop."""
+    quiet: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Show neither progress nor the table at the end, only the path of what was written."""
+    version: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Print the version and stop."""
     checkpoint_seconds: float = 30.0
     """Least seconds between two checkpoints of a stage; 0 makes one every iteration."""
     shard: Shard = "auto"
@@ -59,6 +64,22 @@ class Command:
         return self.run_dir or Path("runs") / f"{Path(self.source).stem}-{time.strftime('%Y%m%d-%H%M%S')}"
 
 
+_INTEGERS = tyro.constructors.ConstructorRegistry()
+
+
+@_INTEGERS.primitive_rule
+def _integer(info: tyro.constructors.PrimitiveTypeInfo) -> tyro.constructors.PrimitiveConstructorSpec | None:
+    """Read integers as Python does, and 1e6 as well."""
+    if info.type is not int:
+        return None
+
+    def read(texts: list[str]) -> int:
+        number = as_integer(texts[0])
+        return int(texts[0]) if number is None else number
+
+    return tyro.constructors.PrimitiveConstructorSpec(1, "INT", read, lambda x: isinstance(x, int), lambda x: [str(x)])
+
+
 C = TypeVar("C", bound=Command)
 K = TypeVar("K")
 
@@ -72,13 +93,18 @@ def answer(args: Sequence[str] | None, program: str, kind: type[C], execute: Cal
       kind: what it takes.
       execute: does it.
     """
-    return tell(lambda: execute(parse(sys.argv[1:] if args is None else args, program, kind)))
+    args = sys.argv[1:] if args is None else args
+    if "--version" in args:
+        return tell(lambda: print(f"taic_jax {__version__}"))
+    return tell(lambda: execute(parse(args, program, kind)))
 
 
-def tell(work: Callable[[], int]) -> int:
-    """Return the exit code of `work`, or 2 after one line that tells what mistake the user made."""
+def tell(work: Callable[[], int | None]) -> int:
+    """Return the exit code of `work`, None being 0, or 2 after one line that tells what mistake the user made."""
     try:
-        return work()
+        code = work() or 0
+        sys.stdout.flush()  # at the end of the process a reader that has gone would be an error
+        return code
     except KeyboardInterrupt:
         print("taic_jax: interrupted", file=sys.stderr)
         return 130
@@ -160,7 +186,7 @@ def typed(args: Sequence[str], program: str, kind: type[K], description: str | N
     if "-h" in args or "--help" in args:  # alone, or tyro leaves the arguments before it out of the help
         args = ["--help"]
     try:
-        with contextlib.redirect_stderr(io.StringIO()):
+        with contextlib.redirect_stderr(io.StringIO()), _INTEGERS:
             return tyro.cli(kind, prog=program, description=description, args=args, **settings)
     except SystemExit as stop:
         if not stop.code:
@@ -173,13 +199,13 @@ def _explain(args: Sequence[str], command: type) -> ConfigError:
     hints = get_type_hints(command)
     if hints.get("config") is Config:
         hints |= {name: _kind(name) for name, _ in walk(Config())}
-    known = {f"--{name}": kind for name, kind in hints.items() if name not in ("source", "config", "runs")}
+    known = {name: kind for name, kind in hints.items() if name not in ("source", "config", "runs")}
     for option, values in _options(args):
-        name = "--" + option.lstrip("-").replace("-", "_")
+        name = option.lstrip("-").replace("-", "_")
         if name not in known or option.endswith("-"):  # tyro keeps the underscore at the end of lambda_
-            return ConfigError(f"unknown option {option}; the nearest is {closest(name, known)}")
+            return ConfigError(f"unknown option {option}{nearest(name, known, '--') or '; --help lists them'}")
         try:
-            with contextlib.redirect_stderr(io.StringIO()):
+            with contextlib.redirect_stderr(io.StringIO()), _INTEGERS:
                 tyro.cli(command, args=[option, *values])
         except SystemExit:
             return mistyped(option, known[name], " ".join(values) or None)

@@ -90,8 +90,8 @@ class CollectConfig:
     """Environment to collect in; empty takes env.name."""
     ticks: int = 1_000_000
     """Budget of interactions per seed."""
-    capacity: int = 1_000_000
-    """Ticks of experience kept."""
+    capacity: int = 0
+    """Newest ticks of experience that are kept, per seed; 0 keeps all."""
     ppo: PPOConfig = PPOConfig()
 
 
@@ -220,6 +220,11 @@ CONFIG_CLASSES = (
 
 COLLECT = "collect"
 """This run's own experience, as a name in `options.experience`."""
+
+
+def kept_ticks(config: CollectConfig) -> int:
+    """Return how many ticks of experience stage collect leaves, per seed, but for the rest of an iteration."""
+    return min(config.capacity or config.ticks, config.ticks)
 
 
 def needs_collect(config: Config) -> bool:

@@ -14,6 +14,15 @@ from taic_jax.config import Config, ConfigError, walk
 
 BASE = "base"
 """Key of a file that names what it starts from, a preset or another file; without it, the defaults."""
+SYNONYMS = {
+    "env": "env.name", "env_id": "env.name", "task": "env.name", "lr": "train.ppo.learning_rate",
+    "discount": "train.ppo.gamma", "gae_lambda": "train.ppo.lambda_", "lam": "train.ppo.lambda_",
+    "clip_range": "train.ppo.clip", "clip_coef": "train.ppo.clip", "ent_coef": "train.ppo.entropy_weight",
+    "vf_coef": "train.ppo.value_weight", "n_envs": "train.ppo.num_envs", "n_steps": "train.ppo.rollout_length",
+    "n_epochs": "train.ppo.epochs", "num_steps": "train.ppo.rollout_length", "total_timesteps": "train.ticks",
+    "timesteps": "train.ticks", "num_seeds": "seeds", "output": "run_dir", "out": "run_dir", "log_dir": "run_dir",
+}  # fmt: skip
+"""Words of other libraries for a field."""
 
 
 def load_config(source: str | Path) -> Config:
@@ -79,7 +88,7 @@ def mistyped(name: str, kind: Any, value: Any) -> ConfigError:
     else:
         plurals = {int: "integers", str: "texts"}
         expected = "a list of " + (f"some of {', '.join(choices)}" if choices else plurals.get(item, "values"))
-    hint = f"; the nearest is {closest(str(value), choices)}" if choices else ""
+    hint = nearest(str(value), choices)
     if kind is int:
         with contextlib.suppress(ValueError, TypeError, OverflowError):
             hint = f"; the nearest is {round(float(value))}"
@@ -99,11 +108,24 @@ def from_text(name: str, kind: Any, text: str) -> Any:
     return _coerce(name, kind, value)
 
 
-def closest(name: str, names: Iterable[str]) -> str:
-    """Return the one of the dotted `names` that looks most like `name`, if possible one that ends like it."""
-    names, end = list(names), name.rpartition(".")[2].lstrip("-")
-    same_end = [known for known in names if known.rpartition(".")[2].lstrip("-") == end]
-    return difflib.get_close_matches(name, same_end or names, n=1, cutoff=0.0)[0]
+def closest(name: str, names: Iterable[str]) -> str | None:
+    """Return the one of the dotted `names` that `name` stands for: by a word that other libraries use, by its end, or
+    by its looks; None where none is like it."""
+    names, (group, _, end) = list(names), name.rpartition(".")
+    if end in SYNONYMS:
+        meant = SYNONYMS[end]
+        candidates = [f"{group}.{meant.rpartition('.')[2]}", meant]
+        if known := [candidate for candidate in candidates if candidate in names]:
+            return known[0]
+    same_end = [known for known in names if known.rpartition(".")[2] == end]
+    found = difflib.get_close_matches(name, same_end or names, n=1, cutoff=0.0 if same_end else 0.6)
+    return found[0] if found else None
+
+
+def nearest(name: str, names: Iterable[str], prefix: str = "") -> str:
+    """Return `; the nearest is ...` for the end of a message, empty where nothing is near."""
+    found = closest(name, names)
+    return f"; the nearest is {prefix}{found}" if found else ""
 
 
 class _Loader(yaml.SafeLoader):
@@ -124,8 +146,8 @@ def _presets() -> Any:
 def _read_text(source: str) -> str:
     if not source.endswith((".yaml", ".yml")) and "/" not in source:
         if source not in preset_names():
-            nearest = closest(source, preset_names())
-            raise ConfigError(f"unknown preset {source!r}; the nearest is {nearest} (a file's name ends in .yaml)")
+            hint = nearest(source, preset_names()) or f"; there are {', '.join(preset_names())}"
+            raise ConfigError(f"unknown preset {source!r}{hint} (a file's name ends in .yaml)")
         return (_presets() / f"{source}.yaml").read_text()
     try:
         return Path(source).read_text()
@@ -143,8 +165,9 @@ def _override(default: Any, changes: Any, prefix: str = "") -> Any:
     for name, value in changes.items():
         if name not in kinds:
             groups = [f"{prefix}{kind}" for kind in kinds] + [BASE] * (not prefix)
-            nearest = closest(f"{prefix}{name}", groups + [known for known, _ in walk(Config())])
-            raise ConfigError(f"unknown field {prefix}{name}; the nearest is {nearest}")
+            hint = nearest(f"{prefix}{name}", groups + [known for known, _ in walk(Config())])
+            hint = hint or f"; there are {', '.join(groups)}"
+            raise ConfigError(f"unknown field {prefix}{name}{hint}")
         old = getattr(default, name)
         if dataclasses.is_dataclass(old):
             values[name] = _override(old, value, f"{prefix}{name}.")
@@ -154,12 +177,15 @@ def _override(default: Any, changes: Any, prefix: str = "") -> Any:
 
 
 def _coerce(name: str, kind: Any, value: Any) -> Any:
-    """Check a YAML value strictly: only integers, and what YAML 1.1 misreads (1e-3), turn into floats."""
+    """Check a YAML value strictly; but integers and 1e-3, a text in YAML 1.1, are floats, and 1e6 is an integer."""
     if kind is float and isinstance(value, int | str) and not isinstance(value, bool):
         try:
             return float(value)
         except ValueError:
             pass
+    elif kind is int and isinstance(value, float | str):
+        if (number := as_integer(value)) is not None:
+            return number
     elif get_origin(kind) is tuple and isinstance(value, list):
         try:
             return tuple(_coerce(name, get_args(kind)[0], item) for item in value)
@@ -168,6 +194,15 @@ def _coerce(name: str, kind: Any, value: Any) -> Any:
     elif value in get_args(kind) if get_origin(kind) is Literal else type(value) is kind:
         return value
     raise mistyped(name, kind, value)
+
+
+def as_integer(value: float | str) -> int | None:
+    """Return the integer that is written as a float or with an exponent, 1e6 say, or None if it is none."""
+    if isinstance(value, str) and "e" not in value.lower():
+        return None
+    with contextlib.suppress(ValueError):
+        return int(float(value)) if float(value).is_integer() else None
+    return None
 
 
 def _show(value: Any) -> str:

@@ -16,7 +16,7 @@ from jaxtyping import Array, Key
 
 from taic_jax.artifacts import DESCRIPTION, Body, read_description
 from taic_jax.checkpoint import ArtifactError
-from taic_jax.config import CollectConfig
+from taic_jax.config import CollectConfig, kept_ticks
 from taic_jax.demonstrations import read_demonstrations
 from taic_jax.envs.base import Env
 from taic_jax.files import save_text, whole_file, writing
@@ -37,7 +37,7 @@ def as_experience(ticks: Rollout, proprioceptive_size: int) -> Experience:
 
 
 def collect(config: CollectConfig, env: Env, key: Key[Array, ""]) -> tuple[ppo.Agent, dict[str, Array], Experience]:
-    """Train flat PPO in `env` and keep its newest `config.capacity` ticks; pure, so keys may be vmapped.
+    """Train flat PPO in `env` and keep its ticks, or the newest `config.capacity`; pure, so keys may be vmapped.
 
     Returns the agent, the metrics of every iteration, and the experience [T, B, ...].
     """
@@ -70,8 +70,8 @@ def _iteration(
 
 
 def num_blocks(config: CollectConfig) -> int:
-    """Return how many iterations' worth of experience the capacity holds, at least one."""
-    return max(config.capacity // (config.ppo.num_envs * config.ppo.rollout_length), 1)
+    """Return how many iterations' worth of experience is kept, at least one."""
+    return max(kept_ticks(config) // (config.ppo.num_envs * config.ppo.rollout_length), 1)
 
 
 def experience_bytes(env: Env, ticks: int) -> int:

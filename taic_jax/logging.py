@@ -1,4 +1,4 @@
-"""Metrics of a run: one row per log point in metrics.jsonl, TensorBoard events, and a progress line.
+"""Metrics of a run: one row per log point in metrics.jsonl, TensorBoard events, and progress on standard error.
 
 metrics.jsonl is the record; the events are drawn from it. So when a run resumes, rows after the checkpoint
 are dropped from the one, and the other is drawn again.
@@ -14,13 +14,12 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from tensorboardX.proto.event_pb2 import Event  # pyright: ignore[reportAttributeAccessIssue]
 from tensorboardX.record_writer import RecordWriter
 from tensorboardX.summary import histogram_raw, scalar
 
 from taic_jax.files import save_text, writing
+from taic_jax.progress import Work, make_display
 
 Row = dict[str, Any]
 Unit = Literal["ticks", "steps"]
@@ -35,7 +34,7 @@ class RunLogger:
 
     Args:
         run_dir: folder of the run; rows that it already holds are kept, but for a half-written last one.
-        quiet: never show the progress line, which otherwise appears on a terminal's standard error.
+        quiet: show no progress.
     """
 
     def __init__(self, run_dir: Path, *, quiet: bool = False):
@@ -45,36 +44,31 @@ class RunLogger:
         with writing(self._path):
             _drop_half_row(self._path)
         self._open()
-        console = Console(stderr=True)
-        self._progress = Progress(
-            TextColumn("{task.description:>8}"),
-            BarColumn(bar_width=24),
-            MofNCompleteColumn(),
-            TextColumn("{task.fields[speed]}  {task.fields[result]}"),
-            TimeRemainingColumn(),
-            console=console,
-            disable=quiet or not console.is_terminal,
-        )
-        self._task: TaskID | None = None
+        self._display, self._stage = make_display(quiet), None
 
     def __enter__(self) -> "RunLogger":
-        self._progress.start()
+        self._display.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._progress.stop()
+        self._display.stop()
         self._close()
 
     @contextlib.contextmanager
     def stage(self, name: str, total: int, done: int = 0) -> Iterator[None]:
         """Show the progress of a stage of `total` ticks or steps, of which `done` were made before a resume."""
-        self._task = self._progress.add_task(name, total=total, completed=done, speed="", result="")
-        self._started, self._done = time.monotonic(), done
-        try:
+        self._stage = Work(name, total, done, done)
+        with self._shown(self._stage):
             yield
-        finally:
-            self._progress.stop_task(self._task)
-            self._task = None
+        self._stage = None
+
+    def say(self, text: str) -> None:
+        """Say something once, among the progress."""
+        self._display.say(text)
+
+    def doing(self, text: str) -> contextlib.AbstractContextManager[None]:
+        """Show in the context that a run is at something that has no measure, as in `train: compiling`."""
+        return self._shown(Work(text))
 
     def log(self, stage: str, count: int, metrics: Mapping[str, Any], unit: Unit = "ticks") -> None:
         """Write one row.
@@ -96,8 +90,8 @@ class RunLogger:
         self._write_events(row)
         with writing(self._events_dir):
             self._events.flush()
-        if self._task is not None:
-            self._show(self._task, row, unit)
+        if self._stage is not None:
+            self._advance(self._stage, row, unit)
 
     def truncate(self, stage: str, count: int) -> None:
         """Drop the rows of a stage after `count`, which a resumed run will write again; -1 drops them all."""
@@ -151,16 +145,18 @@ class RunLogger:
         with writing(self._events_dir):
             self._events.write(Event(wall_time=row["time"], step=_count(row), summary=summary).SerializeToString())
 
-    def _show(self, task: TaskID, row: Row, unit: Unit) -> None:
-        seconds = max(time.monotonic() - self._started, 1e-9)
-        seeds = max(len(value) if isinstance(value, list) else 1 for value in row.values())
-        result = _mean(row.get(f"{row['stage']}/return"))
-        self._progress.update(
-            task,
-            completed=row[unit],
-            speed=f"{seeds * (row[unit] - self._done) / seconds:,.0f} {unit}/s",
-            result="" if result is None else f"return {result:.1f}",
-        )
+    def _advance(self, stage: Work, row: Row, unit: Unit) -> None:
+        stage.done, stage.unit, stage.result = row[unit], unit, _mean(row.get(f"{row['stage']}/return"))
+        stage.seeds = max(len(value) if isinstance(value, list) else 1 for value in row.values())
+        self._display.show(stage)
+
+    @contextlib.contextmanager
+    def _shown(self, work: Work) -> Iterator[None]:
+        self._display.show(work)
+        try:
+            yield
+        finally:
+            self._display.show(None)
 
 
 def read_metrics(path: Path) -> list[Row]:

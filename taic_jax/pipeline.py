@@ -12,7 +12,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from taic_jax.artifacts import OPTIONS, POLICY, describe, load_options, load_policy, save_options, save_policy
-from taic_jax.config import COLLECT, Config, ConfigError, OptionsConfig, Shard, collector_is_baseline, needs_collect
+from taic_jax.config import (
+    COLLECT,
+    Config,
+    ConfigError,
+    OptionsConfig,
+    Shard,
+    collector_is_baseline,
+    kept_ticks,
+    needs_collect,
+)
 from taic_jax.devices import make_devices
 from taic_jax.envs.base import Env
 from taic_jax.envs.errors import RenderingError
@@ -27,7 +36,7 @@ from taic_jax.options import learning
 from taic_jax.options.dataset import Dataset, Experience, holds_out, make_dataset
 from taic_jax.options.execution import IdentityExecutor, make_executor
 from taic_jax.options.model import Networks, OptionModel, make_networks
-from taic_jax.run_folder import claimed, log_folder, prepare_folder
+from taic_jax.run_folder import check_folder, claimed, log_folder, prepare_folder
 from taic_jax.stage import CLOCK, Clock, Run, drive
 from taic_jax.summary import as_summary, write_video
 from taic_jax.tasks import make_envs
@@ -44,6 +53,7 @@ def run_pipeline(
     shard: Shard = "none",
     resume: bool = False,
     overwrite: bool = False,
+    quiet: bool = False,
     **settings: Any,
 ) -> dict:
     """Run every stage that is not done yet and return the summary, also written to `summary.json`.
@@ -56,6 +66,7 @@ def run_pipeline(
       shard: what to split over all devices: these rows, or environments.
       resume: go on with the run in the folder.
       overwrite: replace it.
+      quiet: show no progress on standard error.
       **settings: the `signals`, `checkpoint_seconds` and `population` of `stage.Run`.
 
     Raises:
@@ -72,7 +83,7 @@ def run_pipeline(
     # Seed k of a run is seed 0 of a run whose seed is k more.
     keys = jnp.stack([jax.random.key(config.seed + k) for _ in points for k in range(config.seeds)])
     model, policy = _for_points((model, policy), len(points))
-    with claimed(run_dir), log_folder(run_dir) as logs, RunLogger(logs) as logger:
+    with claimed(run_dir), log_folder(run_dir) as logs, RunLogger(logs, quiet=quiet) as logger:
         clock = Clock.load(run_dir / CLOCK)
         run = Run(as_rows(points, config.seeds), keys, run_dir, logger, clock, devices=devices, **settings)
         logger.truncate("evaluate", -1)
@@ -90,6 +101,21 @@ def run_pipeline(
     except RenderingError as error:  # nothing else depends on it, and all results are saved
         print(f"taic_jax: no video: {error}", file=sys.stderr)
     return summary
+
+
+def check_run(
+    config: Config, run_dir: Path | None, *, resume: bool = False, overwrite: bool = False
+) -> tuple[Env, Env]:
+    """Check all that `run_pipeline` would refuse before it begins; return the task and the environment of `collect`.
+
+    Raises:
+      RunFolderError, ConfigError, ArtifactError: as `run_pipeline`.
+    """
+    env, source = make_envs(config)
+    take_over(config, env, source)
+    if run_dir:
+        check_folder(config, run_dir, resume=resume, overwrite=overwrite)
+    return env, source
 
 
 def take_over(
@@ -133,14 +159,19 @@ def _train(
     Where it begins from another's policy, that explores afresh: the standard deviation is the config's.
     """
     config, level = run.config, make_level(run.config, env, stage)
-    init, assess, agent = (over_rows(env, stage, name) for name in ("init", "assess", "agent"))
+    init, agent = (over_rows(env, stage, name) for name in ("init", "agent"))
     state = jax.jit(init)(config, run.stage_keys(stage), *model)
     if begin:
         params = begin[0].replace(log_std=state.params.log_std)
         state = state.replace(params=params, obs_statistics=begin[1])
     place, given = run.devices.place, (config, run.stage_keys("evaluate"))
-    assess = run.compile(assess, *place((*given, state, *model)))
-    first = jax.device_get(run.rows(assess(*place((*given, state, *model)))))
+    compiled = run.compile(stage, over_rows(env, stage, "assess"), *place((*given, state, *model)))
+
+    def assess(state: Any) -> dict:
+        with run.logger.doing(f"{stage}: evaluating"):
+            return jax.device_get(run.rows(compiled(*place((*given, state, *model)))))
+
+    first = assess(state)
     step, population = step_over_rows(env, stage), run.population if stage == "train" else None
     if population:
         state, step = population.begin(state, config, run.stage_keys(stage)), population.evolving(step)
@@ -149,7 +180,7 @@ def _train(
         num_steps=level.num_steps, unit=level.unit, ticks=level.unit * len(run.keys), after=after,
     )  # fmt: skip
     state = state.state if population else state
-    last = jax.device_get(run.rows(assess(*place((*given, state, *model)))))
+    last = assess(state)
     stopped = run.stopped[stage].code != FINITE
     last = jax.tree.map(lambda x: np.where(stopped.reshape((-1,) + (1,) * (x.ndim - 1)), np.nan, x), last)
     run.logger.log("evaluate", level.ticks, {f"{stage}/{name}": x["return"] for name, x in last.items()})
@@ -185,9 +216,10 @@ def make_level(config: Config, env: Env, stage: str) -> Level:
 
 def collect(run: Run, env: Env) -> Trained:
     """Train flat PPO, keep its trajectories as experience, and save the policy as the artifact `policy`."""
-    store = ExperienceStore(
-        run.dir / EXPERIENCE, num_blocks(run.config.collect), describe(env) | {"seeds": len(run.keys)}
-    )
+    config = run.config.collect
+    if kept_ticks(config) < config.ticks:
+        run.logger.say(f"collect: of {config.ticks:,} ticks the newest {kept_ticks(config):,} are kept")
+    store = ExperienceStore(run.dir / EXPERIENCE, num_blocks(config), describe(env) | {"seeds": len(run.keys)})
     trained = _train(run, env, "collect", after=store.write)
     save_policy(run.dir / POLICY, trained.agent, env)
     return trained
@@ -234,7 +266,7 @@ def select_windows(run: Run, env: Env) -> Dataset:
         for name in names
     ]
     given = run.devices.place((sources, config))
-    dataset = run.rows(run.compile(jax.vmap(partial(make_dataset, views=env.views)), *given)(*given))
+    dataset = run.rows(run.compile("learn", jax.vmap(partial(make_dataset, views=env.views)), *given)(*given))
     span = f"in {', '.join(names)} between its shares {jnp.min(config.since):g} and {jnp.max(config.until):g}"
     if not dataset.count.all():
         raise ConfigError(

@@ -44,7 +44,7 @@ def replay(dump: Path) -> str | None:
         step, like, args = _stage(run, env, source, told["stage"])
         state = load_tree(dump / "state", jax.eval_shape(lambda rows: jax.tree.map(lambda x: x[0], rows), like))
         states = jax.tree.map(lambda x: jnp.broadcast_to(x, (told["seeds"], *x.shape)), state)
-        _, metrics, extra = run.compile(step, states, *args)(states, *args)
+        _, metrics, extra = run.compile(told["stage"], step, states, *args)(states, *args)
     seed, code = told["seed"], int(metrics["nonfinite"][told["seed"]])
     if code == FINITE:
         return None

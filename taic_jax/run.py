@@ -12,6 +12,7 @@ from taic_jax import command_line
 from taic_jax.command_line import FAILED, answer, attempt
 from taic_jax.config import ConfigError
 from taic_jax.config_io import to_yaml
+from taic_jax.interruption import Signals
 
 PROGRAM = "python -m taic_jax.run"
 
@@ -72,31 +73,36 @@ def execute(command: Command) -> int:
         found = replay(command.replay)
         print(found or f"{command.replay}: all numbers were finite this time")
         return 0 if found else FAILED
+    from rich.console import Console
+
     from taic_jax.compilation import keep_programs
     from taic_jax.devices import open_devices
     from taic_jax.hosts import Hosts
-    from taic_jax.pipeline import run_pipeline
-    from taic_jax.summary import plan
-    from taic_jax.tasks import make_envs
+    from taic_jax.pipeline import check_run, run_pipeline
+    from taic_jax.summary import as_table, plan
 
     if command.dry_run:
+        envs = check_run(command.config, command.run_dir, resume=command.resume, overwrite=command.overwrite)
         print(to_yaml(command.config))
-        print(plan(command.config, *make_envs(command.config)))
+        print(plan(command.config, *envs))
         return 0
     keep_programs()
     hosts = Hosts(command.coordinator, command.hosts, command.host)
     shard = open_devices(command.shard, command.config.seeds, hosts)
     run_dir = command.folder
-    code = attempt(
-        lambda signals: run_pipeline(
-            command.config, run_dir, resume=command.resume, overwrite=command.overwrite,
+
+    def work(signals: Signals) -> None:
+        summary = run_pipeline(
+            command.config, run_dir, resume=command.resume, overwrite=command.overwrite, quiet=command.quiet,
             signals=signals, checkpoint_seconds=command.checkpoint_seconds, shard=shard,
-        ),
-        run_dir,
-    )  # fmt: skip
-    if not code:
+        )  # fmt: skip
+        if not command.quiet:
+            Console().print(as_table(summary))
+            print(f"compare and look at runs:  python -m taic_jax.report {run_dir}")
+            print(f"curves (extra viz):        tensorboard --logdir {run_dir}")
         print(run_dir / "summary.json")
-    return code
+
+    return attempt(work, run_dir)
 
 
 if __name__ == "__main__":

@@ -7,15 +7,15 @@ import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
+import filelock
+
 from taic_jax.config import COLLECT, Config, walk
 from taic_jax.config_io import load_config, to_yaml
 from taic_jax.files import PARTIAL, SaveError, remove_partial, save_text, writes_here, writing
 from taic_jax.hosts import agree
 
-try:
-    import fcntl
-except ImportError:  # Windows has none, and no other lock that a killed process gives back
-    fcntl = None
+LOCK = ".lock"
+"""File of a run's folder that the process at work there has locked."""
 
 
 class RunFolderError(ValueError):
@@ -46,21 +46,43 @@ def prepare_folder(config: Config, run_dir: Path, *, resume: bool = False, overw
         raise refused or RunFolderError(f"{run_dir} cannot be used, as the first host tells")
 
 
-def _prepare(config: Config, run_dir: Path, resume: bool, overwrite: bool) -> None:
-    saved, text = run_dir / "config.yaml", to_yaml(config)
+def check_folder(config: Config, run_dir: Path, *, resume: bool = False, overwrite: bool = False) -> None:
+    """Check that the run folder can be used as asked, and change nothing.
+
+    Raises:
+      RunFolderError: the folder holds another run, or none where one is to be resumed or overwritten.
+    """
     if resume:
+        saved = run_dir / "config.yaml"
         if not saved.is_file():
             raise RunFolderError(f"{run_dir} holds no run to resume: no config.yaml in it")
         old = dict(walk(load_config(str(saved))))  # a field that is newer than the run has its default there
         differing = [f"{name}: {value}" for name, value in walk(config) if old[name] != value]
         if differing:
             raise RunFolderError(f"{run_dir} was run with another config, differing in {differing[:1]}")
+    elif _is_used(run_dir):
+        if not overwrite:
+            raise RunFolderError(f"{run_dir} already holds files; add --resume, --overwrite or another --run-dir")
+        if not (run_dir / "config.yaml").is_file():
+            raise RunFolderError(f"{run_dir} is not a run's folder (no config.yaml in it), so it is not overwritten")
+        for name in {config.options.source, *config.options.experience} - {"", COLLECT}:
+            if Path(name).resolve().is_relative_to(run_dir.resolve()):
+                raise RunFolderError(f"{run_dir} holds what this run starts from, {name}, so it is not overwritten")
+
+
+def _prepare(config: Config, run_dir: Path, resume: bool, overwrite: bool) -> None:
+    check_folder(config, run_dir, resume=resume, overwrite=overwrite)
+    if resume:
         return
-    _make_room(config, run_dir, overwrite)
+    if _is_used(run_dir):
+        with claimed(run_dir):
+            for path in run_dir.iterdir():
+                if path.name != LOCK:
+                    shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
     try:
         with writing(run_dir):
             run_dir.mkdir(parents=True, exist_ok=True)
-        save_text(saved, text)
+        save_text(run_dir / "config.yaml", to_yaml(config))
     except SaveError as error:
         raise RunFolderError(f"{error}; nothing was begun") from None
 
@@ -78,42 +100,25 @@ def claimed(run_dir: Path) -> Iterator[None]:
     if not writes_here():
         yield
         return
+    lock = filelock.FileLock(run_dir / LOCK)
     try:
-        file = (run_dir / "config.yaml").open("r+")
+        lock.acquire(blocking=False)
+    except filelock.Timeout:
+        raise BusyError(f"{run_dir} is being written by another process; wait for its end") from None
     except OSError as error:
         raise RunFolderError(f"{run_dir} cannot be written: {error.strerror}") from None
-    with file:
-        if fcntl is not None:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise BusyError(f"{run_dir} is being written by another process; wait for its end") from None
+    try:
         remove_partial(run_dir)
         yield
+    finally:
+        lock.release()
 
 
-def _make_room(config: Config, run_dir: Path, overwrite: bool) -> None:
-    """Remove the run in a folder, if that was asked for and it is one.
-
-    Raises:
-      RunFolderError: it was not, or is not, or cannot be removed.
-    """
-    if not run_dir.exists() or (run_dir.is_dir() and not _holds_files(run_dir)):
-        return
-    if not overwrite:
-        raise RunFolderError(f"{run_dir} already holds files; add --resume, --overwrite or another --run-dir")
-    if not (run_dir / "config.yaml").is_file():
-        raise RunFolderError(f"{run_dir} is not a run's folder (no config.yaml in it), so it is not overwritten")
-    for name in {config.options.source, *config.options.experience} - {"", COLLECT}:
-        if Path(name).resolve().is_relative_to(run_dir.resolve()):
-            raise RunFolderError(f"{run_dir} holds what this run starts from, {name}, so it is not overwritten")
-    with claimed(run_dir):
-        shutil.rmtree(run_dir)
-
-
-def _holds_files(run_dir: Path) -> bool:
-    """Tell whether anything is there but what a process that was killed at its very start leaves."""
-    return any(path.suffix != PARTIAL for path in run_dir.iterdir())
+def _is_used(run_dir: Path) -> bool:
+    """Return whether anything is there but an empty folder, or what a process killed at its very start leaves."""
+    if not run_dir.is_dir():
+        return run_dir.exists()
+    return any(path.suffix != PARTIAL and path.name != LOCK for path in run_dir.iterdir())
 
 
 @contextlib.contextmanager

@@ -124,10 +124,11 @@ class Run:
             raise DivergedError(f"{stage}: every seed has stopped, at numbers that are not finite: see {where}")
         return codes
 
-    def compile(self, function: Callable, *args: Any, donate: bool = False) -> Callable:
+    def compile(self, stage: str, function: Callable, *args: Any, donate: bool = False) -> Callable:
         """Compile ahead of time for placed rows; a call of other shapes or types fails instead of compiling again."""
         start = time.perf_counter()
-        compiled = self.devices.compile(function, *args, donate=donate)
+        with self.logger.doing(f"{stage}: compiling"):
+            compiled = self.devices.compile(function, *args, donate=donate)
         self.clock.compile += time.perf_counter() - start
         return compiled
 
@@ -183,7 +184,7 @@ def drive(
     if first == num_steps:
         return guard.state
     guard, args = run.devices.place((guard, args))
-    compiled = run.compile(guarded(step), guard, *args, donate=True)
+    compiled = run.compile(stage, guarded(step), guard, *args, donate=True)
     saved = time.perf_counter()
     with checkpoints.waited_for(), run.logger.stage(stage, num_steps * unit, done=first * unit):
         for index in range(first, num_steps):

@@ -8,10 +8,12 @@ from typing import Any
 
 import jax
 import numpy as np
+from rich.box import SIMPLE
+from rich.table import Table
 
 from taic_jax.analysis.evaluate import record
-from taic_jax.analysis.statistics import summarize
-from taic_jax.config import COLLECT, Config, collector_is_baseline, needs_collect
+from taic_jax.analysis.statistics import iqm, summarize
+from taic_jax.config import COLLECT, Config, collector_is_baseline, kept_ticks, needs_collect
 from taic_jax.envs.base import Env
 from taic_jax.experience import experience_bytes
 from taic_jax.files import whole_file, writes_here
@@ -44,7 +46,9 @@ def plan(config: Config, env: Env, source: Env) -> str:
         learn = f"{'learn':8} {options.steps:,} gradient steps on windows of {options.length} ticks from {names}"
     lines.insert(1 if collects else 0, learn)
     if collects:
-        size = experience_bytes(source, min(collect.capacity, collect.ticks)) * config.seeds / MIB
+        size = experience_bytes(source, kept_ticks(collect)) * config.seeds / MIB
+        if kept_ticks(collect) < collect.ticks:
+            lines.append(f"{'keep':8} the newest {kept_ticks(collect):,} ticks of collect")
         memory = "" if options.source else f", {2 * size:,.0f} MiB while options are learnt"
         lines.append(f"{'memory':8} experience {size:,.0f} MiB on disk{memory}")
     return "\n".join(lines)
@@ -67,6 +71,33 @@ def as_summary(run: Run, methods: Mapping[str, Mapping[str, Any]]) -> dict[str, 
         "versions": {name: _version(name) for name in PACKAGES},
         "commit": commit(),
     }
+
+
+NAMES = {
+    "taic": "options (TAIC)", "flat": "flat PPO", "repeat": "flat PPO, actions held",
+    "total": "flat PPO, ticks of both stages", "transfer": "flat PPO from the source's policy",
+}  # fmt: skip
+"""Names of methods as `train.baselines` has them."""
+
+
+def as_table(summary: Mapping[str, Any]) -> Table:
+    """Return the returns of a summary, a row a method: interquartile means over seeds, and their 95 % intervals."""
+    table = Table("method", box=SIMPLE, title="return of an episode", title_justify="left", title_style="")
+    for column in ("untrained", "trained, as it explores", "its mean options or actions"):
+        table.add_column(column, justify="right")
+    for name, method in summary["methods"].items():
+        first = iqm(np.array(method["return"]["first_per_seed"], float))
+        trained = [_interval(method[mode]) for mode in ("return", "return_mean_option")]
+        table.add_row(NAMES.get(name, name), f"{first:,.0f}", *trained)
+    return table
+
+
+def _interval(statistics: Mapping[str, Any]) -> str:
+    """Return an interquartile mean with its interval, where several seeds have one."""
+    if statistics["iqm"] is None:
+        return "a seed diverged"
+    low, high = statistics["ci95"]
+    return f"{statistics['iqm']:,.0f}" + ("" if low is None else f" ({low:,.0f} … {high:,.0f})")
 
 
 def _stopped(seeds: Stopped) -> dict[str, dict[str, Any]]:

@@ -11,6 +11,7 @@ BOUNDS: dict[str, tuple[float, float]] = {
     "since": (0, 1),
     "until": (0, 1),
     "steps": (0, math.inf),
+    "capacity": (0, math.inf),
     "change_after": (0, math.inf),
     "num_threads": (0, math.inf),
     "seed": (0, 2**31 - 1),

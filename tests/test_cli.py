@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from taic_jax import run
+from taic_jax import __version__, run
 from taic_jax.checkpoint import ArtifactError
 from taic_jax.config import CONFIG_CLASSES, Config, ConfigError
 from taic_jax.config_io import load_config, to_yaml
@@ -28,12 +28,13 @@ def pipeline(monkeypatch):
     """Stand in for the pipeline, and record what it is asked to run."""
     calls = []
 
-    def run_pipeline(config, run_dir, *, resume, overwrite, signals, checkpoint_seconds, shard):
+    def run_pipeline(config, run_dir, *, resume, overwrite, quiet, signals, checkpoint_seconds, shard):
         calls.append((config, run_dir, resume, overwrite))
 
-    fake = types.SimpleNamespace(run_pipeline=run_pipeline, make_envs=lambda config: ("env", "source"))
+    fake = types.SimpleNamespace(run_pipeline=run_pipeline, check_run=lambda *args, **settings: ("env", "source"))
+    summary = types.SimpleNamespace(plan=lambda *args: "the plan", as_table=lambda summary: "the table")
     monkeypatch.setitem(sys.modules, "taic_jax.pipeline", fake)
-    monkeypatch.setitem(sys.modules, "taic_jax.summary", types.SimpleNamespace(plan=lambda *args: "the plan"))
+    monkeypatch.setitem(sys.modules, "taic_jax.summary", summary)
     return calls
 
 
@@ -66,6 +67,28 @@ def test_resume_takes_the_config_of_the_run(pipeline):
     assert main(["nav2d", "--resume", "--run-dir", "old"]) == 0
     assert [call[0].env.name for call in pipeline] == ["ant", "nav2d"]
     assert pipeline[0][1:] == (Path("old"), True, False)
+
+
+def test_the_end_is_a_table_the_next_commands_and_the_path(pipeline, capsys):
+    assert main(["--run-dir", "a"]) == 0
+    assert main(["--run-dir", "a", "--quiet"]) == 0
+    table, report, curves, path, alone = capsys.readouterr().out.splitlines()
+    assert table == "the table" and report.endswith("python -m taic_jax.report a")
+    assert curves.endswith("tensorboard --logdir a") and path == alone == "a/summary.json"
+
+
+def test_integers_may_have_an_exponent():
+    for args in (["--train.ticks", "1e6"], ["--train.ticks=1.0E6"], ["--train.ticks", "1_000_000"]):
+        assert parse(args).config.train.ticks == 1_000_000
+    assert parse(["--options.mlp-sizes", "1e2", "3"]).config.options.mlp_sizes == (100, 3)
+    Path("mine.yaml").write_text("train: {ticks: 1e6}\ncollect: {ticks: 1.5e6}\nseed: 1.0e+1")
+    config = parse(["mine.yaml"]).config
+    assert (config.train.ticks, config.collect.ticks, config.seed) == (1_000_000, 1_500_000, 10)
+
+
+def test_the_version_is_that_of_the_package(capsys):
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"taic_jax {__version__}\n"
 
 
 def test_dry_run_prints_the_config_and_the_plan_and_stops(pipeline, capsys):
@@ -112,10 +135,15 @@ BAD_ARGUMENTS = {
     "unknown group": ("--trian.ticks 3", "--trian.ticks", "--train.ticks"),
     "hyphen at the end": ("--train.ppo.lambda- 0.9", "unknown option --train.ppo.lambda-;", "is --train.ppo.lambda_"),
     "group as option": ("--train.ppo 3", "unknown option --train.ppo;", "nearest is --train.ppo."),
-    "short option": ("-x", "unknown option -x", "nearest"),
+    "short option": ("-x", "unknown option -x", "--help lists them"),
+    "like no option": ("--zebra 3", "unknown option --zebra; --help lists them", "--zebra"),
+    "another library's word": ("--lr 1", "unknown option --lr;", "nearest is --train.ppo.learning_rate"),
+    "such a word in a group": ("--collect.ppo.lr 1", "option --collect.ppo.lr;", "is --collect.ppo.learning_rate"),
+    "the task by another word": ("--env ant", "unknown option --env;", "nearest is --env.name"),
+    "like no preset": ("zebra", "unknown preset 'zebra'; there are ant, ", "a file's name ends in .yaml"),
     "text for float": ("--train.ppo.clip wide", "--train.ppo.clip: expected a number", "'wide'"),
     "float for integer": ("--seeds 2.6", "--seeds: expected an integer, got '2.6'", "nearest is 3"),
-    "exponent for integer": ("--train.ticks 1e6", "--train.ticks: expected an integer", "nearest is 1000000"),
+    "exponent for a fraction": ("--train.ticks 15e-1", "--train.ticks: expected an integer", "nearest is 2"),
     "empty value": ("--seed=", "--seed: expected an integer", "nothing"),
     "no value": ("--seed", "--seed: expected an integer", "nothing"),
     "no folder": ("--run-dir", "--run-dir: expected", "nothing"),

@@ -10,7 +10,7 @@ from probes import Counting, assert_trees_equal
 
 from taic_jax.artifacts import describe
 from taic_jax.checkpoint import ArtifactError
-from taic_jax.config import CollectConfig, PPOConfig
+from taic_jax.config import CollectConfig, PPOConfig, kept_ticks
 from taic_jax.envs import make_env
 from taic_jax.experience import ExperienceStore, collect, gather_experience, num_blocks, read_experience
 from taic_jax.options.dataset import Experience
@@ -137,6 +137,13 @@ def test_collect_returns_the_newest_ticks():
     np.testing.assert_array_equal(experience.obs[..., 0], expected)
     np.testing.assert_array_equal(experience.reward, expected + 1)
     assert experience.action.shape == (8, 2, 1) and not experience.done.any()
+
+
+def test_all_ticks_are_kept_but_where_the_capacity_is_smaller():
+    ppo = PPOConfig(num_envs=2, rollout_length=4)
+    blocks = {capacity: num_blocks(CollectConfig(ticks=5 * 8, capacity=capacity, ppo=ppo)) for capacity in (0, 16, 99)}
+    assert blocks == {0: 5, 16: 2, 99: 5}
+    assert CollectConfig().capacity == 0 and kept_ticks(CollectConfig(ticks=3_000_000)) == 3_000_000
 
 
 def test_description_is_json(tmp_path):

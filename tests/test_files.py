@@ -1,6 +1,7 @@
 """A run that cannot write ends in one line, loses nothing that was saved, and goes on when it can."""
 
 import json
+import os
 import re
 from pathlib import Path
 
@@ -51,7 +52,7 @@ def test_a_full_disk_ends_the_run_in_one_line_and_it_goes_on(whole, monkeypatch,
     owner, method, count, told = FULL[case]
     with monkeypatch.context() as patch:
         fill_at(patch, limit, owner, method, count)
-        assert main(["config.yaml", "--run-dir", "run", "--checkpoint-seconds", "0"]) == 74
+        assert main(["config.yaml", "--run-dir", "run", "--checkpoint-seconds", "0", "--quiet"]) == 74
     limit(None)
     (line,) = capsys.readouterr().err.splitlines()
     assert re.match(rf"taic_jax: error: (/.*/)?run/{told}: cannot be written: File too large;", line), line
@@ -97,14 +98,14 @@ def test_where_nothing_can_be_written_nothing_is_begun(capsys, limit):
 
 
 def test_a_read_only_run_is_not_resumed(whole, monkeypatch, capfd):
-    original = Path.open
+    original = os.open
 
-    def read_only(self, mode="r", *args, **kwargs):
-        if mode != "r":
-            raise PermissionError(30, "Read-only file system", str(self))
-        return original(self, mode, *args, **kwargs)
+    def read_only(path, flags, *args, **kwargs):
+        if Path(path).is_relative_to(whole) and flags & (os.O_RDWR | os.O_WRONLY):
+            raise OSError(30, "Read-only file system", str(path))
+        return original(path, flags, *args, **kwargs)
 
-    monkeypatch.setattr(Path, "open", read_only)
+    monkeypatch.setattr(os, "open", read_only)
     assert main(["--run-dir", str(whole), "--resume"]) == 2
     assert f"{whole} cannot be written: Read-only file system" in capfd.readouterr().err
 

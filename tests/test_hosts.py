@@ -36,7 +36,7 @@ def begin(folder: Path, count: int, *args: str, differ: tuple[str, ...] = ()) ->
     (folder / "slope.py").write_text(SLOPE)
     (folder / "config.yaml").write_text(to_yaml(LONG))
     paths = os.pathsep.join(str(path) for path in (TESTS, TESTS.parent))
-    line = [sys.executable, "-W", "ignore", "-m", "taic_jax.run", "config.yaml", "--run-dir", "run", *args]
+    line = [sys.executable, "-W", "ignore", "-m", "taic_jax.run", "config.yaml", "--run-dir", "run", "--quiet", *args]
     if count > 1:
         line += ["--hosts", str(count), "--coordinator", f"127.0.0.1:{free_port()}"]
     return [

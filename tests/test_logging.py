@@ -152,20 +152,3 @@ def test_a_half_written_row_is_dropped(tmp_path):
     with RunLogger(tmp_path) as logger:
         logger.log("train", 40, {})
     assert [row["ticks"] for row in read_metrics(path)] == [10, 20, 30, 10, 20, 30, 40]
-
-
-def test_progress_is_silent_when_not_a_terminal(tmp_path, capfd):
-    with RunLogger(tmp_path) as logger, logger.stage("train", 20):
-        logger.log("train", 20, {"return": 1.0})
-    assert capfd.readouterr() == ("", "")
-
-
-@pytest.mark.parametrize(("quiet", "shown"), [(False, True), (True, False)])
-def test_progress_on_a_terminal(tmp_path, capfd, monkeypatch, quiet, shown):
-    monkeypatch.setenv("FORCE_COLOR", "1")
-    monkeypatch.setenv("COLUMNS", "120")
-    with RunLogger(tmp_path, quiet=quiet) as logger, logger.stage("train", 40, done=20):
-        logger.log("train", 30, {"return": np.array([1.0, 4.0])})
-    out, err = capfd.readouterr()
-    assert out == ""
-    assert ("train" in err and "ticks/s" in err and "return 2.5" in err) == shown

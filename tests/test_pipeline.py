@@ -2,6 +2,8 @@
 
 import dataclasses
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import jax
@@ -31,7 +33,7 @@ from taic_jax.experience import ExperienceStore, read_experience
 from taic_jax.logging import RunLogger
 from taic_jax.options.dataset import Experience
 from taic_jax.pipeline import over_rows, run_pipeline
-from taic_jax.run_folder import RunFolderError
+from taic_jax.run_folder import BusyError, RunFolderError, claimed
 from taic_jax.tasks import make_envs
 from taic_jax.types import as_rows
 
@@ -124,6 +126,33 @@ def test_refuses_folders_that_are_not_its_own(finished, tmp_path):
     with pytest.raises(RunFolderError):
         run_pipeline(CONFIG, tmp_path / "thesis.txt", overwrite=True)
     assert (tmp_path / "thesis.txt").read_text() == "years of work"
+
+
+CLAIM = """
+import sys
+from pathlib import Path
+from taic_jax.run_folder import claimed
+with claimed(Path(sys.argv[1])):
+    print("claimed", flush=True)
+    sys.stdin.read()
+"""
+
+
+def test_a_folder_is_given_back_by_a_process_that_is_killed(tmp_path):
+    child = subprocess.Popen(
+        [sys.executable, "-c", CLAIM, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    assert child.stdout and child.stdin and child.stdout.readline() == "claimed\n"
+    with pytest.raises(BusyError, match="is being written by another process"), claimed(tmp_path):
+        pytest.fail("two processes at one folder")
+    child.kill()
+    child.wait()
+    child.stdout.close()
+    child.stdin.close()
+    with claimed(tmp_path), pytest.raises(BusyError), claimed(tmp_path):
+        pytest.fail("two runs of one process at one folder")
+    with claimed(tmp_path):
+        pass
 
 
 def test_overwrites_a_run_when_asked(finished, tmp_path, monkeypatch):

@@ -92,7 +92,7 @@ BAD_BASES = {
     "missing": ("base: ./none.yaml", "experiment.yaml: base: ./none.yaml: expected a YAML file", "No such file"),
     "not text": ("base: [ant]", "experiment.yaml: base: expected a preset's name or a file", "got ['ant']"),
     "nothing": ("base:", "experiment.yaml: base: expected a preset's name or a file", "got nothing"),
-    "empty": ("base: ''", "experiment.yaml: base: unknown preset ''", "nearest"),
+    "empty": ("base: ''", "experiment.yaml: base: unknown preset ''", "there are ant, "),
     "itself": ("base: FOLDER/experiment.yaml", "base: expected an end", "experiment.yaml -> "),
     "cycle": ("base: FOLDER/second.yaml", "base: expected an end", "second.yaml -> "),
     "bad field in it": ("base: FOLDER/bad.yaml", "unknown field trian", "nearest is train"),

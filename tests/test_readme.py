@@ -1,10 +1,11 @@
-"""The README is tested: its Python blocks run, and so do its commands, as dry runs."""
+"""The README is tested: its Python blocks run, twice in one interpreter, and so do its commands, as dry runs."""
 
 import os
 import re
 import shlex
 import subprocess
 import sys
+import textwrap
 from pathlib import Path
 
 import pytest
@@ -24,20 +25,43 @@ def commands() -> list[str]:
     return [line.strip() for line in lines if line.strip().startswith(MODULE)]
 
 
-def run(args: list[str], cwd: Path) -> None:
+def run(args: list[str], cwd: Path, code: int = 0) -> str:
     env = {**os.environ, "PYTHONPATH": str(ROOT)}
     done = subprocess.run([sys.executable, *args], cwd=cwd, env=env, capture_output=True, text=True)
-    assert done.returncode == 0, done.stdout[-1000:] + done.stderr[-3000:]
+    assert done.returncode == code, done.stdout[-1000:] + done.stderr[-3000:]
+    return done.stderr
 
 
 def test_there_is_something_to_run():
     assert blocks("python") and commands()
 
 
+def test_the_front_pages_are_short():
+    assert len(TEXT.splitlines()) <= 110
+    assert len((ROOT / "RESULTS.md").read_text().splitlines()) <= 140
+
+
+PAGES = ["README.md", "RESULTS.md", "CHANGELOG.md", "CONTRIBUTING.md", "experiments/README.md"]
+PAGES += ["experiments/logbook.md", *(f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md"))]
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_links_lead_to_files_and_headings_that_are_there(page):
+    text = re.sub(r"^```.*?^```$", "", (ROOT / page).read_text(), flags=re.MULTILINE | re.DOTALL)
+    for link in re.findall(r"\]\(([^)\s]+)\)", text):
+        if link.startswith("https://"):
+            continue
+        target, _, anchor = link.partition("#")
+        path = (ROOT / page).parent / target if target else ROOT / page
+        assert path.exists(), link
+        headings = re.findall(r"^#+ (.*)$", path.read_text(), re.MULTILINE) if anchor else []
+        assert not anchor or anchor in {re.sub(r"[^\w -]", "", h).lower().replace(" ", "-") for h in headings}, link
+
+
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize("code", blocks("python"))
 def test_python_blocks_run(code, tmp_path):
-    (tmp_path / "block.py").write_text(code)
+    (tmp_path / "block.py").write_text(f"for _ in range(2):\n{textwrap.indent(code, '    ')}")
     run(["block.py"], tmp_path)
 
 
@@ -46,5 +70,9 @@ def test_commands_are_valid(command, tmp_path):
     args = shlex.split(command, comments=True)[1:]
     if args[1] == "taic_jax.run" and not {"--dry-run", "--help"} & set(args):
         args.append("--dry-run")
-    run(args, tmp_path)
+    if {"--options", "--resume"} & set(args):  # the run that it names is not there
+        (folder,) = (arg for arg in args if arg.startswith("runs/"))
+        assert folder in run(args, tmp_path, code=2)
+    else:
+        run(args, tmp_path)
     assert not any(tmp_path.iterdir())

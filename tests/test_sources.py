@@ -40,7 +40,7 @@ def in_empty_folder(tmp_path, monkeypatch):
 
 def main_with(config: Config, *args: str) -> int:
     Path("mine.yaml").write_text(to_yaml(config))
-    return main(["mine.yaml", "--run-dir", "new", *args])
+    return main(["mine.yaml", "--run-dir", "new", "--quiet", *args])
 
 
 def experience(ticks: int, first: float, seeds: int = 1) -> Experience:

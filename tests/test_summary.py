@@ -1,11 +1,14 @@
 """What a run's summary says, by hand."""
 
+import io
 import subprocess
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from taic_jax import summary
+from taic_jax.analysis.statistics import summarize
 from taic_jax.summary import _durations, _method
 
 
@@ -28,6 +31,27 @@ def test_durations_of_a_method_are_those_of_the_exploring_policy():
     assert method["duration"]["mean"] == 1.75 and method["duration"]["histogram"] == [0.25, 0.75]
     assert set(method["metrics"]) == {"return", "length"}
     assert "durations" in last["return_mean_option"]
+
+
+def test_the_table_has_a_row_a_method_with_intervals_where_there_are_several_seeds():
+    def method(first, last, mean):
+        return {"return": summarize(last) | {"first_per_seed": first}, "return_mean_option": summarize(mean)}
+
+    seeds = [1000.0, 2000.0, 3000.0, 4000.0]
+    methods = {
+        "taic": method([1.0, 2.0, 3.0, 4.0], seeds, [5.0] * 4),
+        "flat": method([7.0], [-1234.5], [8.0]),
+        "repeat": method([1.0, 2.0], [1.0, np.nan], [1.0, 2.0]),
+    }
+    console = Console(width=100, file=io.StringIO())
+    console.print(summary.as_table({"methods": methods}))
+    lines = [line.split("  ") for line in console.file.getvalue().splitlines()]  # pyright: ignore
+    cells = {cells[0]: cells[1:] for line in lines if (cells := [text.strip() for text in line if text.strip()])}
+    low, high = summarize(seeds)["ci95"]
+    assert cells["options (TAIC)"] == ["2", f"2,500 ({low:,.0f} … {high:,.0f})", "5 (5 … 5)"]
+    assert cells["flat PPO"] == ["7", "-1,234", "8"]
+    assert cells["flat PPO, actions held"][:2] == ["2", "a seed diverged"]
+    assert "trained, as it explores" in cells["method"]
 
 
 def test_commit_is_dirty_where_the_package_was_changed_and_nowhere_else(tmp_path, monkeypatch):

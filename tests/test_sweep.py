@@ -3,9 +3,11 @@
 import csv
 import json
 import random
+import sys
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 from PIL import Image
 from tiny_runs import CONFIG, SLOPE, KilledError, die, tiny_steps, with_fields
@@ -139,7 +141,8 @@ def test_optuna_asks_for_points_and_goes_on(monkeypatch):
 
 BAD = {
     "none": ("", "--axes: expected at least one"),
-    "unknown": ("--axes train.ppo.lerning_rate=1", "nearest field is train.ppo.learning_rate"),
+    "unknown": ("--axes train.ppo.lerning_rate=1", "nearest is train.ppo.learning_rate"),
+    "another library's word": ("--axes collect.ppo.lr=1", "nearest is collect.ppo.learning_rate"),
     "no values": ("--axes options.size=", "options.size: expected values"),
     "no equals": ("--axes options.size", "expected FIELD=VALUES"),
     "mistyped": ("--axes options.size=2,x", "options.size: expected an integer, got 'x'"),
@@ -164,6 +167,23 @@ def test_bad_axes_are_told_in_one_line(capfd, args, message):
     assert not Path("new").exists()
 
 
+@pytest.mark.parametrize("dry", [[], ["--dry-run"]], ids=["sweep", "dry run"])
+def test_what_is_missing_is_refused_before_anything_is_written_or_measured(monkeypatch, capfd, dry):
+    from taic_jax.sweep import memory
+
+    monkeypatch.setattr(memory, "points_that_fit", lambda *_: pytest.fail("minutes of measuring"))
+    axes = ["--axes", RATE, "--run-dir", "new"]
+    refusals = {"--options none": "none: expected a run", "--resume": "new holds no run to resume"}
+    for option, message in refusals.items():
+        assert main(["config.yaml", *option.split(), *axes, *dry]) == 2
+        assert message in capfd.readouterr().err
+    monkeypatch.setitem(sys.modules, "optuna", None)  # as where it is not installed
+    monkeypatch.delitem(sys.modules, "taic_jax.sweep.asking", raising=False)
+    assert main(["config.yaml", "--optuna", "3", *axes, *dry]) == 2
+    assert "the package optuna is not installed" in capfd.readouterr().err
+    assert not Path("new").exists()
+
+
 def test_the_plan_is_told_before_anything_runs(capfd):
     assert main(["config.yaml", "--axes", RATE, LENGTH, "--chunk", "1", "--dry-run"]) == 0
     out = capfd.readouterr().out
@@ -178,3 +198,17 @@ def test_chunks_are_as_large_as_memory_allows(capfd):
     assert memory.points_that_fit(CONFIG, 64_000) > memory.points_that_fit(CONFIG, 32_000) > 100
     with pytest.raises(ConfigError):
         memory.points_that_fit(CONFIG, 1)
+
+
+def test_memory_that_is_in_use_is_counted_in_bytes_on_every_system():
+    """Half a GiB more in use leaves no room; macOS counts peaks in bytes, Linux in KiB."""
+    from taic_jax.sweep import memory
+
+    memory.row_bytes(CONFIG)  # compiling takes memory too
+    limit = psutil.Process().memory_info().rss // 2**20 + 200
+    assert limit < memory.machine_memory() <= psutil.virtual_memory().total // 2**20
+    assert memory.points_that_fit(CONFIG, limit) > 1
+    more = np.ones(2**26)
+    with pytest.raises(ConfigError, match="--memory: expected at least"):
+        memory.points_that_fit(CONFIG, limit)
+    assert more[-1] == 1.0

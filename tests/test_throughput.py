@@ -18,6 +18,7 @@ from taic_jax.experiments.costs import SMALLEST, Saved, Widened, scaling, shares
 from taic_jax.experiments.loops import WORK, Training, options_config
 from taic_jax.experiments.peers import brax_ppo
 from taic_jax.experiments.processes import Sweep, starts, sweep_costs
+from taic_jax.experiments.throughput import share_text
 from taic_jax.experiments.turns import Loop, Speeds, take_turns
 from taic_jax.options.execution import IdentityExecutor
 
@@ -176,6 +177,11 @@ def test_table_and_json_hold_what_is_promised(tmp_path, capsys):
     assert list(told["shares"]) == ["physics", "transfer", "policy", "update"]
     assert sum(told["shares"].values()) == pytest.approx(1.0)
     assert "option_training/2 seeds" in capsys.readouterr().out
+
+
+def test_a_share_that_noise_made_negative_is_no_share():
+    assert share_text("update", 0.324) == "update 32%"
+    assert share_text("policy", -0.04) == "policy too little to be told from noise"
 
 
 def test_peers_that_are_missing_are_told(monkeypatch):

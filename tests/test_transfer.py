@@ -173,8 +173,18 @@ def test_collect_runs_only_where_something_needs_it(fields, needed, baseline):
 
 
 LEARN = "learn    4 gradient steps on windows of 2 ticks from"
+KEEP = "keep     the newest 32 ticks of collect"
 PLANS = [
-    ({}, ["collect  nav2d: 48", f"{LEARN} collect", "train    nav2d: 48", "memory   experience"]),
+    (
+        {},
+        [
+            "collect  nav2d: 48",
+            f"{LEARN} collect",
+            "train    nav2d: 48",
+            "keep     the newest 32 ticks",
+            "memory   experience",
+        ],
+    ),
     (
         {"train__baselines": ("repeat", "total", "transfer"), "options__source": "a"},
         [
@@ -187,11 +197,24 @@ PLANS = [
     ),
     (
         {"options__source": "a"},
-        ["collect  nav2d: 48", "options  as learnt in a", "train    nav2d: 48", "memory   experience 0 MiB on disk"],
+        [
+            "collect  nav2d: 48",
+            "options  as learnt in a",
+            "train    nav2d: 48",
+            "keep     the newest 32 ticks",
+            "memory   experience 0 MiB on disk",
+        ],
     ),
     (
         {"options__experience": ("collect", "a"), "collect__env": "nav2d_random"},
-        ["collect  nav2d_random: 48", f"{LEARN} collect, a", "train    nav2d: 48", "flat     nav2d: 48", "memory   "],
+        [
+            "collect  nav2d_random: 48",
+            f"{LEARN} collect, a",
+            "train    nav2d: 48",
+            "flat     nav2d: 48",
+            "keep     the newest 32 ticks",
+            "memory   ",
+        ],
     ),
     ({"options__experience": ("a",), "train__baselines": ()}, [f"{LEARN} a", "train    nav2d: 48"]),
 ]

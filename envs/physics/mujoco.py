@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import mujoco
 import mujoco.batch
 import numpy as np
+import psutil
 from jax import Array
 from jaxtyping import Float
 
@@ -144,7 +145,7 @@ def _as_bytes(model: mujoco.MjModel) -> bytes:
 def num_physical_cores() -> int:
     """Count the physical cores this process may use; the hyperthreads of a core count once."""
     if not hasattr(os, "sched_getaffinity"):
-        return os.cpu_count() or 1
+        return psutil.cpu_count(logical=False) or 1
     cores = set()
     for cpu in os.sched_getaffinity(0):
         siblings = Path(f"/sys/devices/system/cpu/cpu{cpu}/topology/thread_siblings_list")

@@ -142,7 +142,7 @@ def _nearest(folder: Path) -> str:
     for parent, prefix in ((folder, "holds"), (folder.parent, "the nearest is")):
         runs = [path.parent.name for path in parent.glob("*/config.yaml")] if parent.is_dir() else []
         if runs:
-            return f"; {prefix} {parent / closest(folder.name, runs)}"
+            return f"; {prefix} {parent / (closest(folder.name, runs) or sorted(runs)[0])}"
     return ""
 
 

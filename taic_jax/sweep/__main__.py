@@ -3,6 +3,7 @@
 Points that differ in numbers alone run with all their seeds in one program; what is static splits them into several.
 """
 
+import importlib
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -49,17 +50,20 @@ def execute(command: Command) -> int:
         connect(command.cluster)
     if command.optuna:
         points = []
+        importlib.import_module("taic_jax.sweep.asking")  # without Optuna it is refused here, before a folder is made
     else:
         points = sample(axes, command.samples, command.config.seed) if command.samples else grid(axes)
         configs_of(command.config, points)
     from taic_jax.compilation import keep_programs
     from taic_jax.devices import open_devices
+    from taic_jax.pipeline import check_run
     from taic_jax.sweep.memory import points_that_fit
-    from taic_jax.sweep.runs import TABLE, Plan, run_sweep
+    from taic_jax.sweep.runs import TABLE, Plan, run_sweep, sweep_config
 
     keep_programs()
     asked = "none" if command.pbt and command.shard == "auto" else command.shard
     shard = open_devices(asked, command.config.seeds * (len(points) or command.optuna))
+    check_run(sweep_config(command.config), command.run_dir, resume=command.resume, overwrite=command.overwrite)
     # A sweep that is resumed keeps the chunks that it had: there is nothing to measure.
     size = command.chunk or (1 if command.resume else points_that_fit(command.config, command.memory))
     plan = Plan(
@@ -74,8 +78,8 @@ def execute(command: Command) -> int:
     code = attempt(
         lambda signals: run_sweep(
             command.config, axes, plan, run_dir, resume=command.resume, overwrite=command.overwrite,
-            on_cluster=bool(command.cluster), signals=signals, checkpoint_seconds=command.checkpoint_seconds,
-            shard=shard,
+            on_cluster=bool(command.cluster), quiet=command.quiet, shard=shard, signals=signals,
+            checkpoint_seconds=command.checkpoint_seconds,
         ),
         run_dir,
     )  # fmt: skip

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any, get_type_hints
 
 from taic_jax.config import Config, ConfigError, replace, walk
-from taic_jax.config_io import closest, from_text
+from taic_jax.config_io import from_text, nearest
 from taic_jax.validation import validate
 
 RANGE, LOGARITHMIC = "..", ":log"
@@ -56,7 +56,7 @@ def parse_axis(text: str) -> Axis:
     name = name.strip().replace("-", "_")
     if name not in kinds or not equals:
         what = f"unknown field {name!r}" if equals else f"expected FIELD=VALUES, got {text!r}"
-        raise ConfigError(f"--axes: {what}; the nearest field is {closest(name, kinds)}")
+        raise ConfigError(f"--axes: {what}{nearest(name, kinds)}")
     if name in ("seed", "seeds"):
         raise ConfigError(f"--axes: {name}: every point runs the same seeds; give them by --seed and --seeds")
     if RANGE not in values:

@@ -1,15 +1,14 @@
 """How many points of a sweep fit into memory at once: measured on the programs for one row."""
 
-import os
-import resource
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import psutil
 
-from taic_jax.config import Config, ConfigError, needs_collect
+from taic_jax.config import Config, ConfigError, kept_ticks, needs_collect
 from taic_jax.experience import experience_bytes, num_blocks
 from taic_jax.options.dataset import Experience, make_dataset
 from taic_jax.pipeline import over_rows
@@ -26,9 +25,9 @@ def points_that_fit(config: Config, memory: int) -> int:
       ConfigError: not even one does.
     """
     limit = (memory or machine_memory() // 2) * MIB
-    used = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    used = psutil.Process().memory_info().rss
     _, source = make_envs(config)
-    least = 2 * experience_bytes(source, config.collect.capacity) * config.seeds if needs_collect(config) else 0
+    least = 2 * experience_bytes(source, kept_ticks(config.collect)) * config.seeds if needs_collect(config) else 0
     if used + least < limit:
         count = int((limit - used) / (row_bytes(config) * config.seeds))
         if count:
@@ -54,7 +53,7 @@ def row_bytes(config: Config) -> int:
 
 def machine_memory() -> int:
     """Return the MiB that this process may use in all."""
-    total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    total = psutil.virtual_memory().total
     limit = Path("/sys/fs/cgroup/memory.max")
     text = limit.read_text().strip() if limit.exists() else "max"
     return min(total, int(text) if text.isdigit() else total) // MIB

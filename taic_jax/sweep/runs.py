@@ -22,7 +22,7 @@ from taic_jax.interruption import DivergedError
 from taic_jax.logging import read_metrics
 from taic_jax.pipeline import run_pipeline
 from taic_jax.population import Population, schedule
-from taic_jax.run_folder import RunFolderError, claimed, prepare_folder
+from taic_jax.run_folder import LOCK, RunFolderError, claimed, prepare_folder
 from taic_jax.sweep.axes import Axis, chunks, configs_of, show
 from taic_jax.sweep.marginals import draw_marginals
 
@@ -74,7 +74,7 @@ def run_sweep(
       Interrupted: a signal was received; resume goes on from where it came.
       RunFolderError: the folder holds another sweep, or none to resume, or another process is at it.
     """
-    config = replace(config, "evaluate.video_ticks", 0)
+    config = sweep_config(config)
     if plan.pbt:
         bounds = {axis.name: axis.bounds for axis in axes}
         settings["population"] = Population(plan.pbt, bounds, config.seeds)
@@ -96,6 +96,11 @@ def run_sweep(
             told = _best_member(config, plan, run_dir) if plan.pbt else _best_point(config, plan, finished)
             save_text(run_dir / BEST, told)
         draw_marginals(run_dir / MARGINALS, axes, plan.points, {row["point"]: row["iqm"] for row in table})
+
+
+def sweep_config(config: Config) -> Config:
+    """Return the config that all points start from: without videos."""
+    return replace(config, "evaluate.video_ticks", 0)
 
 
 def _best_point(config: Config, plan: Plan, table: list[dict[str, Any]]) -> str:
@@ -203,7 +208,7 @@ def _resumed(plan: Plan, run_dir: Path) -> Plan:
     Raises:
       RunFolderError: there is none, or it is of other axes.
     """
-    if {path.name for path in run_dir.iterdir()} == {"config.yaml"}:
+    if {path.name for path in run_dir.iterdir()} == {"config.yaml", LOCK}:
         return plan
     try:
         saved = Plan(**json.loads((run_dir / PLAN).read_text()))
