@@ -23,7 +23,7 @@ from taic_jax.experiments.drawing import RESULTS
 from taic_jax.experiments.figure5c import recovered
 from taic_jax.experiments.figure7 import with_interval, write_numbers
 from taic_jax.experiments.spaces import PREFIX
-from taic_jax.experiments.table import TABLE, Runs, TableError, read_table, select
+from taic_jax.experiments.table import TABLE, EvidenceRows, TableError, read_table, select
 
 # What the figures show of a row, where it has it: heading, and the number per seed.
 MEASURES = {
@@ -67,7 +67,7 @@ def counterpart(row: dict[str, Any], rows: Sequence[dict[str, Any]]) -> dict[str
     raise TableError(f"{name}: the table has no row of {row['seeds']} seeds from {row['seed']}")
 
 
-def compare(ours: Runs, theirs: Runs) -> list[dict[str, Any]]:
+def compare(ours: EvidenceRows, theirs: EvidenceRows) -> list[dict[str, Any]]:
     """Return a line per measure: what the table says, what came out again, and whether it is within the interval."""
     lines = []
     for measure, name in MEASURES.items():
@@ -83,7 +83,7 @@ def compare(ours: Runs, theirs: Runs) -> list[dict[str, Any]]:
     return [known | line | {"within": line["low"] <= line["again"] <= line["high"]} for line in lines]
 
 
-def share(runs: Runs, names: Sequence[str]) -> dict[str, float]:
+def share(runs: EvidenceRows, names: Sequence[str]) -> dict[str, float]:
     """Return the share of seeds that recovered, and its exact 95 % interval."""
     back = recovered(runs)
     return dict(zip(names, (float(np.mean(back)), *exact_interval(int(back.sum()), len(back))), strict=True))

@@ -12,7 +12,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
 from taic_jax import envs
-from taic_jax.checkpoint import Checkpoints
 from taic_jax.config import PPOConfig
 from taic_jax.experiments.loops import (
     Training,
@@ -26,6 +25,7 @@ from taic_jax.experiments.loops import (
 )
 from taic_jax.experiments.turns import Loop, take_turns
 from taic_jax.options.execution import IdentityExecutor
+from taic_jax.runtime.checkpoint import Checkpoints
 
 FACTORS = (1, 4, 16)
 SMALLEST = {"environments": 16, "seeds": 1, "option length": 2, "observation size": 8}

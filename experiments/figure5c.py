@@ -22,7 +22,7 @@ from taic_jax.experiments.cells import RECOVERING, RECOVERY
 from taic_jax.experiments.drawing import BLACK, RED, RESULTS, mark, plt, save, styled
 from taic_jax.experiments.figure7 import write_numbers
 from taic_jax.experiments.recovery import AFTER, RECOVERED
-from taic_jax.experiments.table import TABLE, Runs, TableError, read_table, select
+from taic_jax.experiments.table import TABLE, EvidenceRows, TableError, read_table, select
 
 SEEDS = 50
 BEFORE = 80_000
@@ -42,12 +42,12 @@ class Arguments:
     """The picture; its numbers are written beside it as CSV."""
 
 
-def recovered(runs: Runs) -> np.ndarray:
+def recovered(runs: EvidenceRows) -> np.ndarray:
     """Return which seeds recovered [K]; one whose room never changed, or not for long enough, has not."""
     return np.nan_to_num(runs.numbers["success_after"]) >= RECOVERED
 
 
-def numbers(runs: Runs) -> dict[str, Any]:
+def numbers(runs: EvidenceRows) -> dict[str, Any]:
     """Return what the table of the figure says of one method."""
     back, learnt = recovered(runs), np.nan_to_num(runs.numbers["success_before"]) >= RECOVERED
     count, total = int(back.sum()), len(back)
@@ -61,7 +61,7 @@ def numbers(runs: Runs) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def around_the_change(runs: Runs, grid: np.ndarray) -> np.ndarray:
+def around_the_change(runs: EvidenceRows, grid: np.ndarray) -> np.ndarray:
     """Return the share of successes [K, G] at ticks counted from each seed's own change; NaN where it never came."""
     rows = []
     for curve, at in zip(runs.curves["success"], runs.numbers["changed_at"], strict=True):
@@ -72,7 +72,7 @@ def around_the_change(runs: Runs, grid: np.ndarray) -> np.ndarray:
 
 
 @styled
-def draw(found: dict[str, Runs], rows: list[dict[str, Any]], out: Path) -> None:
+def draw(found: dict[str, EvidenceRows], rows: list[dict[str, Any]], out: Path) -> None:
     """Draw the share of successes around the change, and how many seeds recovered."""
     figure, (left, right) = plt.subplots(1, 2, figsize=(9.5, 3.8), width_ratios=(3, 1))
     grid = np.linspace(-BEFORE, AFTER, 71)

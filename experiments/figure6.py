@@ -23,7 +23,7 @@ from taic_jax.experiments.cells import METHODS, OTHERS, SPACES
 from taic_jax.experiments.drawing import BLUE, GREY, RESULTS, mark, plt, save, styled
 from taic_jax.experiments.figure7 import with_interval, write_numbers
 from taic_jax.experiments.spaces import PREFIX
-from taic_jax.experiments.table import TABLE, Runs, TableError, read_table, select
+from taic_jax.experiments.table import TABLE, EvidenceRows, TableError, read_table, select
 
 PERPLEXITIES = (10, 30, 90)
 MODELS = 10
@@ -69,7 +69,7 @@ def embed(points: Any, perplexity: int) -> Float[np.ndarray, "N 2"]:
     return TSNE(perplexity=perplexity, init="pca", random_state=0).fit_transform(np.asarray(points, np.float32))
 
 
-def numbers(runs: Runs) -> list[dict[str, Any]]:
+def numbers(runs: EvidenceRows) -> list[dict[str, Any]]:
     """Return a row for each measure of one kind of options: its mean over option models, with a 95 % interval."""
     rows = []
     for name, values in runs.numbers.items():

@@ -43,7 +43,7 @@ from taic_jax.experiments.drawing import (
     save,
     styled,
 )  # fmt: skip
-from taic_jax.experiments.table import DIGITS, TABLE, Runs, TableError, read_table, select
+from taic_jax.experiments.table import DIGITS, TABLE, EvidenceRows, TableError, read_table, select
 
 COLOURS = dict(zip(METHODS, (BLACK, OLIVE, GREY, PINK, SKY, ORANGE, BLUE, GREEN, RED, PURPLE), strict=True))
 BASELINE = "strong"
@@ -73,7 +73,7 @@ class Arguments:
 
 def read_methods(
     rows: Sequence[dict[str, Any]], task: str, methods: dict[str, tuple[str, int]]
-) -> tuple[dict[str, Runs], list[str]]:
+) -> tuple[dict[str, EvidenceRows], list[str]]:
     """Return those of the methods, each with label and fewest seeds, that the table holds for a task, and remarks."""
     found, remarks = {}, []
     held = {row["method"] for row in rows if row["task"] == task}
@@ -92,7 +92,7 @@ def with_interval(values: np.ndarray, names: Sequence[str] = ("iqm", "low", "hig
     return dict(zip(names, (float(iqm(values)), *bootstrap_interval(values)), strict=True))
 
 
-def numbers(runs: Runs, methods: dict[str, Runs]) -> list[dict[str, Any]]:
+def numbers(runs: EvidenceRows, methods: dict[str, EvidenceRows]) -> list[dict[str, Any]]:
     """Return what the table of the figure says of one method, in one row, beside flat PPO on the same task."""
     last, curve = runs.numbers["last"], runs.curves["return"]
     area = np.nanmean(curve, axis=1)
@@ -139,7 +139,7 @@ def adjust(rows: list[dict[str, Any]]) -> None:
 
 
 @styled
-def draw(found: dict[str, tuple[dict[str, Runs], list[str]]], out: Path) -> None:
+def draw(found: dict[str, tuple[dict[str, EvidenceRows], list[str]]], out: Path) -> None:
     """Draw a column per task: over task ticks alone, and with the ticks that options were learnt from counted in."""
     figure, panels = plt.subplots(2, len(found), figsize=(4.1 * len(found) + 0.4, 7.6), squeeze=False)
     for column, (task, (methods, remarks)) in enumerate(found.items()):
@@ -184,8 +184,8 @@ def make_figure(
     figure: str,
     arguments: Any,
     methods: dict[str, tuple[str, int]],
-    draw: Callable[[dict[str, tuple[dict[str, Runs], list[str]]], Path], None],
-    numbers: Callable[[Runs, dict[str, Runs]], list[dict[str, Any]]],
+    draw: Callable[[dict[str, tuple[dict[str, EvidenceRows], list[str]]], Path], None],
+    numbers: Callable[[EvidenceRows, dict[str, EvidenceRows]], list[dict[str, Any]]],
     fields: Sequence[str],
 ) -> None:
     """Draw a figure of several tasks and write its numbers.

@@ -39,7 +39,7 @@ from taic_jax.experiments.drawing import (
     styled,
 )
 from taic_jax.experiments.figure7 import BOUNDS, make_figure, with_interval
-from taic_jax.experiments.table import TABLE, Runs
+from taic_jax.experiments.table import TABLE, EvidenceRows
 
 SEEDS = 10
 COLOURS = {"open": ORANGE, "closed": RED, "tuned": PURPLE, "flat": BLACK, "transfer": BLUE}
@@ -71,14 +71,14 @@ class Arguments:
     """Panels."""
 
 
-def measured(runs: Runs) -> dict[str, np.ndarray]:
+def measured(runs: EvidenceRows) -> dict[str, np.ndarray]:
     """Return the measures [K] of one method: those of evaluation, and the end of each curve of training."""
     ends = {ours: runs.curves[name][:, -LATE:] for name, ours in CURVES.items() if name in runs.curves}
     late = {name: np.nanmean(end, axis=1) for name, end in ends.items()}
     return {name: runs.numbers[name] for name in MEASURES if name in runs.numbers} | late
 
 
-def at_goal(runs: Runs, measure: str) -> dict[str, str]:
+def at_goal(runs: EvidenceRows, measure: str) -> dict[str, str]:
     """Return how many seeds are at the goal: in half of the evaluation, or at any time in training."""
     if measure == "final/success":
         there = runs.numbers[measure] >= 0.5
@@ -89,7 +89,7 @@ def at_goal(runs: Runs, measure: str) -> dict[str, str]:
     return {"seeds_at_goal": f"{there.sum()}/{len(there)}"}
 
 
-def numbers(runs: Runs, methods: dict[str, Runs]) -> list[dict[str, Any]]:
+def numbers(runs: EvidenceRows, methods: dict[str, EvidenceRows]) -> list[dict[str, Any]]:
     """Return what the table of the figure says of one method, a row per measure; p is of the worse comparison."""
     rows, others = [], {name: measured(methods[name]) for name in COMPARED if name in methods}
     for measure, values in measured(runs).items():
@@ -109,7 +109,7 @@ def numbers(runs: Runs, methods: dict[str, Runs]) -> list[dict[str, Any]]:
 
 
 @styled
-def draw(found: dict[str, tuple[dict[str, Runs], list[str]]], out: Path) -> None:
+def draw(found: dict[str, tuple[dict[str, EvidenceRows], list[str]]], out: Path) -> None:
     """Draw a column per task: the return, and where there is a goal the share of ticks spent at it."""
     goals = any("mean/success" in runs.curves for methods, _ in found.values() for runs in methods.values())
     names = ("return", "mean/success")[: 1 + goals]

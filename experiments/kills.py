@@ -26,7 +26,7 @@ import tyro
 from taic_jax.command_line import tell
 from taic_jax.config import CollectConfig, Config, EnvConfig, EvaluateConfig, OptionsConfig, PPOConfig, TrainConfig
 from taic_jax.config_io import to_yaml
-from taic_jax.logging import read_metrics
+from taic_jax.runtime.logging import read_metrics
 
 POINTS = ("--axes", "train.ppo.learning_rate=3e-4,1e-3", "--chunk", "1")
 """Of the sweep: a chunk, that is a whole run, for each."""
@@ -97,7 +97,7 @@ def outcome(folder: Path) -> dict[str, Any]:
 
 
 def _arrays(folder: Path) -> Iterator[tuple[str, bytes]]:
-    from taic_jax.checkpoint import load_arrays
+    from taic_jax.runtime.checkpoint import load_arrays
 
     for path in sorted(folder.rglob("*.npz")):
         with np.load(path) as blocks:

@@ -15,13 +15,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from taic_jax import envs
+from taic_jax.artifacts.experience import as_experience
 from taic_jax.config import OptionsConfig, PPOConfig
-from taic_jax.devices import Devices
-from taic_jax.experience import as_experience
 from taic_jax.options.execution import Executor, IdentityExecutor, OptionExecutor, make_executor
 from taic_jax.options.learning import learn
 from taic_jax.rl import ppo
-from taic_jax.rl.rollout import Rollout, Running, rollout, start
+from taic_jax.rl.rollout import Rollout, RolloutCarry, rollout, start
+from taic_jax.runtime.devices import Devices
 from taic_jax.types import as_arrays
 
 WORK = PPOConfig(num_envs=64, rollout_length=256, epochs=10, minibatch_size=512)
@@ -42,7 +42,7 @@ def has_engine(env: envs.Env) -> bool:
 
 def untrained_rollout(
     env: envs.Env, num_envs: int, length: int
-) -> tuple[Callable[[Running], tuple[Running, Rollout]], Running]:
+) -> tuple[Callable[[RolloutCarry], tuple[RolloutCarry, Rollout]], RolloutCarry]:
     """Return a compiled rollout of `length` ticks with an untrained policy, and its start."""
     executor, key = IdentityExecutor(env.action_size), jax.random.key(0)
     state = ppo.init(as_arrays(PPOConfig(num_envs=num_envs)), env, executor, key)

@@ -12,11 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from taic_jax.artifacts import load_options
+from taic_jax.artifacts.experience import EXPERIENCE, read_experience
+from taic_jax.artifacts.models import load_options
 from taic_jax.config import COLLECT, OptionsConfig
 from taic_jax.config_io import load_config
 from taic_jax.envs.navigation import MAX_SPEED, Navigation
-from taic_jax.experience import EXPERIENCE, read_experience
 from taic_jax.networks import apply
 from taic_jax.options.dataset import gather, make_dataset
 from taic_jax.options.model import OptionModel, make_networks

@@ -22,11 +22,11 @@ import tyro
 
 from taic_jax.analysis import option_space
 from taic_jax.analysis.evaluate import evaluate
+from taic_jax.artifacts.experience import gather_experience
 from taic_jax.command_line import tell
 from taic_jax.config import Config, ConfigError, walk
 from taic_jax.config_io import load_config
 from taic_jax.envs.base import Env
-from taic_jax.experience import gather_experience
 from taic_jax.options.dataset import Experience
 from taic_jax.options.execution import make_executor
 from taic_jax.options.learning import learn

@@ -19,8 +19,8 @@ from taic_jax.experiments.cells import FLAT, METHODS, OTHERS, ROBOTS
 from taic_jax.experiments.drawing import RESULTS
 from taic_jax.experiments.figure7 import BASELINE, read_methods, with_interval
 from taic_jax.experiments.spaces import PREFIX
-from taic_jax.experiments.table import TABLE, Runs, TableError, read_table
-from taic_jax.files import save_text
+from taic_jax.experiments.table import TABLE, EvidenceRows, TableError, read_table
+from taic_jax.runtime.files import save_text
 
 # Heading, and the number per seed that stands below it.
 COLUMNS = {
@@ -72,7 +72,7 @@ def cell(values: np.ndarray | None) -> str:
     return mean if low == high else f"{mean} ({low} … {high})"
 
 
-def line(runs: Runs, flat: Runs | None) -> list[str]:
+def line(runs: EvidenceRows, flat: EvidenceRows | None) -> list[str]:
     """Return the cells of one method on one task."""
     cells = [runs.task, *kind(runs.method), str(len(runs.seeds))]
     p = (

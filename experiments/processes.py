@@ -15,15 +15,15 @@ from pathlib import Path
 import jax
 
 from taic_jax import envs
-from taic_jax.compilation import keep_programs
 from taic_jax.config import OptionsConfig, PPOConfig
-from taic_jax.devices import Devices, open_devices
 from taic_jax.envs.physics.mujoco import num_physical_cores
 from taic_jax.experiments.loops import Training, learnt_executor, untrained_ticks
 from taic_jax.experiments.turns import seconds
-from taic_jax.logging import read_metrics
 from taic_jax.options.execution import Executor, IdentityExecutor
 from taic_jax.rl import ppo
+from taic_jax.runtime.devices import Devices, open_devices
+from taic_jax.runtime.logging import read_metrics
+from taic_jax.runtime.program_cache import keep_programs
 from taic_jax.types import as_arrays, as_rows
 
 PATIENCE = 600.0

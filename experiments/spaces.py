@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from taic_jax.analysis import option_space
-from taic_jax.artifacts import load_options
+from taic_jax.artifacts.experience import EXPERIENCE, read_experience
+from taic_jax.artifacts.models import load_options
 from taic_jax.config import COLLECT
 from taic_jax.config_io import load_config
-from taic_jax.experience import EXPERIENCE, read_experience
 from taic_jax.options.execution import make_executor
 from taic_jax.tasks import make_envs
 from taic_jax.types import as_arrays

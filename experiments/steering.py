@@ -20,8 +20,7 @@ import tyro
 from jaxtyping import Array, Float, Key
 
 from taic_jax.analysis.option_space import always
-from taic_jax.artifacts import load_options
-from taic_jax.checkpoint import ArtifactError
+from taic_jax.artifacts.models import load_options
 from taic_jax.command_line import tell
 from taic_jax.config import ConfigError
 from taic_jax.config_io import load_config
@@ -31,7 +30,8 @@ from taic_jax.envs.wrappers import AutoReset, Wrapper
 from taic_jax.experiments.drawing import RESULTS
 from taic_jax.experiments.figure7 import with_interval, write_numbers
 from taic_jax.options.execution import Executor, make_executor
-from taic_jax.rl.rollout import Running, rollout, start
+from taic_jax.rl.rollout import RolloutCarry, rollout, start
+from taic_jax.runtime.checkpoint import ArtifactError
 from taic_jax.tasks import make_envs
 from taic_jax.types import as_arrays
 
@@ -61,8 +61,8 @@ class Unending(Wrapper):
 
 
 def hold(
-    env: Env, executor: Executor, begin: Running, codes: Float[Array, "N D"], key: Key[Array, ""]
-) -> tuple[Running, Float[Array, "N 2"]]:
+    env: Env, executor: Executor, begin: RolloutCarry, codes: Float[Array, "N D"], key: Key[Array, ""]
+) -> tuple[RolloutCarry, Float[Array, "N 2"]]:
     """Hold a code in each environment, chosen anew whenever its option ends; return what is then, and the way made."""
     begin = begin.replace(ended=jnp.ones_like(begin.ended))
     after, _ = rollout(env, executor, partial(always, codes), begin, key, round(SECONDS / env.dt))

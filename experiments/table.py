@@ -16,8 +16,8 @@ import numpy as np
 from taic_jax.config import Config, walk
 from taic_jax.config_io import load_config
 from taic_jax.experiments.recovery import recovery_of
-from taic_jax.files import save_text
-from taic_jax.logging import read_metrics
+from taic_jax.runtime.files import save_text
+from taic_jax.runtime.logging import read_metrics
 
 TABLE = Path("experiments/results/evidence.jsonl")
 GRID = 50
@@ -34,7 +34,7 @@ class TableError(ValueError):
 
 
 @dataclasses.dataclass(frozen=True)
-class Runs:
+class EvidenceRows:
     """One method on one task, of all seeds that the table holds."""
 
     task: str
@@ -184,7 +184,7 @@ def on_grid(rows: Sequence[dict[str, Any]], values: np.ndarray, grid: np.ndarray
     return np.where(latest >= 0, values[:, np.maximum(latest, 0)], np.nan)
 
 
-def select(rows: Sequence[dict[str, Any]], task: str, method: str, minimum: int = 1) -> Runs:
+def select(rows: Sequence[dict[str, Any]], task: str, method: str, minimum: int = 1) -> EvidenceRows:
     """Return what the table holds of one method on one task.
 
     Raises:
@@ -208,7 +208,7 @@ def select(rows: Sequence[dict[str, Any]], task: str, method: str, minimum: int 
         remarks.append(f"mixed versions of {', '.join(sorted(differing))}")
     if stopped := sum(len(row["stopped"]) for row in found):
         remarks.append(f"{stopped} diverged")
-    return Runs(
+    return EvidenceRows(
         task, method, tuple(seeds), found[0]["ticks"], found[0]["pretraining"], np.array(found[0]["grid"]),
         {k: np.array([c for row in found for c in row["curves"][k]], float) for k in found[0]["curves"]},
         {k: np.array([x for row in found for x in row["numbers"][k]], float) for k in found[0]["numbers"]},

@@ -19,7 +19,6 @@ import tyro
 
 from taic_jax import envs
 from taic_jax.command_line import tell
-from taic_jax.compilation import keep_programs
 from taic_jax.config import ConfigError, OptionsConfig, PPOConfig
 from taic_jax.config_io import load_config, preset_names
 from taic_jax.envs.errors import MissingExtraError
@@ -39,6 +38,7 @@ from taic_jax.experiments.peers.brax_ppo import PIPELINES, DoesNotRunError, tick
 from taic_jax.experiments.processes import SeedsApart, Sweep, starts, sweep_costs
 from taic_jax.experiments.turns import Loop, Speeds, take_turns
 from taic_jax.options.execution import Executor, IdentityExecutor
+from taic_jax.runtime.program_cache import keep_programs
 
 HEADLINE = "option_training"
 PAPER = ("fixed", "open")

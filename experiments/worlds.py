@@ -20,13 +20,13 @@ import tyro
 
 from taic_jax import envs
 from taic_jax.command_line import tell
-from taic_jax.compilation import keep_programs
 from taic_jax.envs.arenas import outside
 from taic_jax.envs.physics.mjx import MjxPhysics
 from taic_jax.envs.physics.mujoco import MujocoPhysics
 from taic_jax.envs.third_party import third_party
 from taic_jax.experiments.loops import bare_engine, stepping
 from taic_jax.experiments.turns import Loop, take_turns
+from taic_jax.runtime.program_cache import keep_programs
 
 ROUNDS = 7
 ARENAS = ("ant_maze", "ant_push", "ant_fall")

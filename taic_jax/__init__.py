@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from taic_jax.analysis.evaluate import evaluate, record
     from taic_jax.analysis.measures import measure_option_space
     from taic_jax.analysis.statistics import bootstrap_interval, iqm
+    from taic_jax.artifacts.experience import collect
     from taic_jax.config import (
         CollectConfig,
         Config,
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
     )
     from taic_jax.config_io import load_config
     from taic_jax.envs import AutoReset, Env, State, environment_names, make_env
-    from taic_jax.experience import collect
     from taic_jax.options.dataset import Experience
     from taic_jax.options.execution import Executor, IdentityExecutor, OptionExecutor, make_executor
     from taic_jax.options.learning import learn
@@ -43,7 +43,7 @@ _MODULES = {
     ),
     "config_io": ("load_config",),
     "envs": ("AutoReset", "Env", "State", "environment_names", "make_env"),
-    "experience": ("collect",),
+    "artifacts.experience": ("collect",),
     "options.dataset": ("Experience",),
     "options.execution": ("Executor", "IdentityExecutor", "OptionExecutor", "make_executor"),
     "options.learning": ("learn",),

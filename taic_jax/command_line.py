@@ -22,8 +22,8 @@ import tyro
 from taic_jax import __version__
 from taic_jax.config import Config, ConfigError, Shard, walk
 from taic_jax.config_io import as_integer, load_config, mistyped, nearest, preset_names
-from taic_jax.files import SaveError
-from taic_jax.interruption import DivergedError, Interrupted, Signals
+from taic_jax.runtime.files import SaveError
+from taic_jax.runtime.signals import DivergedError, Interrupted, Signals
 from taic_jax.validation import validate
 
 DEFAULT_PRESET = "nav2d"

@@ -11,7 +11,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from taic_jax.artifacts import OPTIONS, POLICY, describe, load_options, load_policy, save_options, save_policy
+from taic_jax.artifacts.experience import EXPERIENCE, ExperienceStore, gather_experience, num_blocks
+from taic_jax.artifacts.models import OPTIONS, POLICY, describe, load_options, load_policy, save_options, save_policy
 from taic_jax.config import (
     COLLECT,
     Config,
@@ -22,24 +23,23 @@ from taic_jax.config import (
     kept_ticks,
     needs_collect,
 )
-from taic_jax.devices import make_devices
 from taic_jax.envs.base import Env
 from taic_jax.envs.errors import RenderingError
-from taic_jax.experience import EXPERIENCE, ExperienceStore, gather_experience, num_blocks
-from taic_jax.files import save_text
-from taic_jax.guard import FINITE
-from taic_jax.level import FineTunedLevel, Level, Trained
-from taic_jax.logging import RunLogger
 from taic_jax.networks import PolicyParams
-from taic_jax.normalize import Statistics
+from taic_jax.nonfinite import FINITE
 from taic_jax.options import learning
 from taic_jax.options.dataset import Dataset, Experience, holds_out, make_dataset
 from taic_jax.options.execution import IdentityExecutor, make_executor
 from taic_jax.options.model import Networks, OptionModel, make_networks
-from taic_jax.run_folder import check_folder, claimed, log_folder, prepare_folder
-from taic_jax.stage import CLOCK, Clock, Run, drive
+from taic_jax.rl.normalize import Statistics
+from taic_jax.runtime.devices import make_devices
+from taic_jax.runtime.driver import CLOCK, Clock, Run, drive
+from taic_jax.runtime.files import save_text
+from taic_jax.runtime.logging import RunLogger
+from taic_jax.runtime.run_folder import check_folder, claimed, log_folder, prepare_folder
 from taic_jax.summary import as_summary, write_video
 from taic_jax.tasks import make_envs
+from taic_jax.trainer import FineTuneTrainer, Trained, Trainer
 from taic_jax.types import as_rows
 
 STEPS_PER_LOG = 100
@@ -158,7 +158,7 @@ def _train(
 
     Where it begins from another's policy, that explores afresh: the standard deviation is the config's.
     """
-    config, level = run.config, make_level(run.config, env, stage)
+    config, trainer = run.config, make_trainer(run.config, env, stage)
     init, agent = (over_rows(env, stage, name) for name in ("init", "agent"))
     state = jax.jit(init)(config, run.stage_keys(stage), *model)
     if begin:
@@ -177,41 +177,41 @@ def _train(
         state, step = population.begin(state, config, run.stage_keys(stage)), population.evolving(step)
     state = drive(
         run, stage, step, state, config, *model,
-        num_steps=level.num_steps, unit=level.unit, ticks=level.unit * len(run.keys), after=after,
+        num_steps=trainer.num_steps, unit=trainer.unit, ticks=trainer.unit * len(run.keys), after=after,
     )  # fmt: skip
     state = state.state if population else state
     last = assess(state)
     stopped = run.stopped[stage].code != FINITE
     last = jax.tree.map(lambda x: np.where(stopped.reshape((-1,) + (1,) * (x.ndim - 1)), np.nan, x), last)
-    run.logger.log("evaluate", level.ticks, {f"{stage}/{name}": x["return"] for name, x in last.items()})
+    run.logger.log("evaluate", trainer.ticks, {f"{stage}/{name}": x["return"] for name, x in last.items()})
     return Trained(agent(config, state, *model), first, last)
 
 
 def over_rows(env: Env, stage: str, method: str) -> Callable[..., Any]:
-    """Return a method of a stage's level as a function of rows: (configs, *its arguments)."""
+    """Return a method of a stage's trainer as a function of rows: (configs, *its arguments)."""
     return jax.vmap(partial(_call, env, stage, method))
 
 
 def step_over_rows(env: Env, stage: str) -> Callable[..., Any]:
-    """Return a step of a stage's level as `drive` takes it: (states, configs, *models)."""
+    """Return a step of a stage's trainer as `drive` takes it: (states, configs, *models)."""
     step = over_rows(env, stage, "step")
     return lambda state, config, *model: step(config, state, *model)
 
 
 def _call(env: Env, stage: str, method: str, config: Config, *args: Any) -> Any:
-    return getattr(make_level(config, env, stage), method)(*args)
+    return getattr(make_trainer(config, env, stage), method)(*args)
 
 
-def make_level(config: Config, env: Env, stage: str) -> Level:
+def make_trainer(config: Config, env: Env, stage: str) -> Trainer:
     """Return what a stage trains: a policy over options, or a flat one (see `TrainConfig.baselines`)."""
     episodes, tune = config.evaluate.episodes, config.train.fine_tune
     if stage == "train":
         executor_of = partial(make_executor, config.options, env.action_size)
-        level = Level(env, config.train.ppo, config.train.ticks, episodes, executor_of)
-        return FineTunedLevel(**vars(level), fine_tune=tune) if tune.epochs else level
+        trainer = Trainer(env, config.train.ppo, config.train.ticks, episodes, executor_of)
+        return FineTuneTrainer(**vars(trainer), fine_tune=tune) if tune.epochs else trainer
     ticks = {"collect": config.collect.ticks, "total": config.collect.ticks + config.train.ticks}
     executor = IdentityExecutor(env.action_size, config.options.length if stage == "repeat" else 1)
-    return Level(env, config.collect.ppo, ticks.get(stage, config.train.ticks), episodes, lambda: executor)
+    return Trainer(env, config.collect.ppo, ticks.get(stage, config.train.ticks), episodes, lambda: executor)
 
 
 def collect(run: Run, env: Env) -> Trained:

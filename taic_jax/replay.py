@@ -8,15 +8,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from taic_jax.artifacts import DESCRIPTION, load_options
-from taic_jax.checkpoint import ArtifactError, load_tree
+from taic_jax.artifacts.models import DESCRIPTION, load_options
 from taic_jax.config_io import load_config
 from taic_jax.envs.base import Env
-from taic_jax.guard import FINITE, QUANTITIES
-from taic_jax.logging import RunLogger
+from taic_jax.nonfinite import FINITE, QUANTITIES
 from taic_jax.options.model import make_networks
 from taic_jax.pipeline import learn_over_rows, over_rows, select_windows, step_over_rows
-from taic_jax.stage import Clock, Run
+from taic_jax.runtime.checkpoint import ArtifactError, load_tree
+from taic_jax.runtime.driver import Clock, Run
+from taic_jax.runtime.logging import RunLogger
 from taic_jax.tasks import make_envs
 from taic_jax.types import as_arrays, as_rows
 

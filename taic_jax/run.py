@@ -12,7 +12,7 @@ from taic_jax import command_line
 from taic_jax.command_line import FAILED, answer, attempt
 from taic_jax.config import ConfigError
 from taic_jax.config_io import to_yaml
-from taic_jax.interruption import Signals
+from taic_jax.runtime.signals import Signals
 
 PROGRAM = "python -m taic_jax.run"
 
@@ -75,10 +75,10 @@ def execute(command: Command) -> int:
         return 0 if found else FAILED
     from rich.console import Console
 
-    from taic_jax.compilation import keep_programs
-    from taic_jax.devices import open_devices
-    from taic_jax.hosts import Hosts
     from taic_jax.pipeline import check_run, run_pipeline
+    from taic_jax.runtime.devices import open_devices
+    from taic_jax.runtime.hosts import Hosts
+    from taic_jax.runtime.program_cache import keep_programs
     from taic_jax.summary import as_table, plan
 
     if command.dry_run:

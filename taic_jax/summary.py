@@ -13,13 +13,13 @@ from rich.table import Table
 
 from taic_jax.analysis.evaluate import record
 from taic_jax.analysis.statistics import iqm, summarize
+from taic_jax.artifacts.experience import experience_bytes
 from taic_jax.config import COLLECT, Config, collector_is_baseline, kept_ticks, needs_collect
 from taic_jax.envs.base import Env
-from taic_jax.experience import experience_bytes
-from taic_jax.files import whole_file, writes_here
-from taic_jax.guard import FINITE, QUANTITIES
+from taic_jax.nonfinite import FINITE, QUANTITIES
 from taic_jax.rl.ppo import Agent, num_iterations
-from taic_jax.stage import Run, Stopped
+from taic_jax.runtime.driver import Run, Stopped
+from taic_jax.runtime.files import whole_file, writes_here
 
 PACKAGES = ("taic_jax", "jax", "jaxlib", "flax", "optax", "brax", "mujoco", "mujoco-mjx", "orbax-checkpoint")
 MIB = 2**20

@@ -4,7 +4,7 @@ import dataclasses
 
 import jax
 
-from taic_jax.artifacts import describe
+from taic_jax.artifacts.models import describe
 from taic_jax.config import Config, ConfigError
 from taic_jax.envs import environment_options, make_env
 from taic_jax.envs.base import Env

@@ -11,11 +11,11 @@ from pathlib import Path
 import pytest
 
 from taic_jax import __version__, run
-from taic_jax.checkpoint import ArtifactError
 from taic_jax.config import CONFIG_CLASSES, Config, ConfigError
 from taic_jax.config_io import load_config, to_yaml
-from taic_jax.interruption import Interrupted
 from taic_jax.run import main, parse
+from taic_jax.runtime.checkpoint import ArtifactError
+from taic_jax.runtime.signals import Interrupted
 
 
 @pytest.fixture(autouse=True)

@@ -24,16 +24,17 @@ from tiny_runs import (
     with_fields,
 )
 
-from taic_jax import pipeline, stage
-from taic_jax.checkpoint import Checkpoints, load_arrays
+from taic_jax import pipeline
+from taic_jax.artifacts.experience import ExperienceStore, read_experience
 from taic_jax.config import Config, ConfigError, TrainConfig
 from taic_jax.config_io import load_config
 from taic_jax.envs import make_env
-from taic_jax.experience import ExperienceStore, read_experience
-from taic_jax.logging import RunLogger
 from taic_jax.options.dataset import Experience
 from taic_jax.pipeline import over_rows, run_pipeline
-from taic_jax.run_folder import BusyError, RunFolderError, claimed
+from taic_jax.runtime import driver
+from taic_jax.runtime.checkpoint import Checkpoints, load_arrays
+from taic_jax.runtime.logging import RunLogger
+from taic_jax.runtime.run_folder import BusyError, RunFolderError, claimed
 from taic_jax.tasks import make_envs
 from taic_jax.types import as_rows
 
@@ -131,7 +132,7 @@ def test_refuses_folders_that_are_not_its_own(finished, tmp_path):
 CLAIM = """
 import sys
 from pathlib import Path
-from taic_jax.run_folder import claimed
+from taic_jax.runtime.run_folder import claimed
 with claimed(Path(sys.argv[1])):
     print("claimed", flush=True)
     sys.stdin.read()
@@ -232,4 +233,6 @@ def test_experience_without_the_windows_that_are_needed_is_refused(tmp_path, mon
     options = dataclasses.replace(CONFIG.options, termination="predict", since=since, until=until)
     config = as_rows([dataclasses.replace(CONFIG, options=options, seeds=1)], 1)
     with RunLogger(tmp_path) as logger, pytest.raises(ConfigError, match=message):
-        pipeline.learn(stage.Run(config, jax.random.split(jax.random.key(0), 1), tmp_path, logger, stage.Clock()), env)
+        pipeline.learn(
+            driver.Run(config, jax.random.split(jax.random.key(0), 1), tmp_path, logger, driver.Clock()), env
+        )

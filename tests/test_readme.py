@@ -46,8 +46,10 @@ PAGES += ["experiments/logbook.md", *(f"docs/{path.name}" for path in (ROOT / "d
 
 
 @pytest.mark.parametrize("page", PAGES)
-def test_links_lead_to_files_and_headings_that_are_there(page):
+def test_links_and_paths_lead_to_what_is_there(page):
     text = re.sub(r"^```.*?^```$", "", (ROOT / page).read_text(), flags=re.MULTILINE | re.DOTALL)
+    for path in re.findall(r"`((?:taic_jax|envs|experiments|tests)/[\w/.]+)`", text):
+        assert (ROOT / path).exists(), path
     for link in re.findall(r"\]\(([^)\s]+)\)", text):
         if link.startswith("https://"):
             continue

@@ -19,11 +19,11 @@ from tiny_runs import (
     with_fields,
 )
 
-from taic_jax import guard, pipeline
-from taic_jax.checkpoint import Checkpoints, load_arrays
+from taic_jax import nonfinite, pipeline
 from taic_jax.config import Config, ConfigError, collector_is_baseline, needs_collect
 from taic_jax.pipeline import run_pipeline
-from taic_jax.stage import STAGES
+from taic_jax.runtime.checkpoint import Checkpoints, load_arrays
+from taic_jax.runtime.driver import STAGES
 from taic_jax.summary import plan
 from taic_jax.tasks import make_envs
 
@@ -101,7 +101,7 @@ def test_the_transferred_policy_starts_where_the_source_run_ended(source, transf
 
     def drive(run, stage, step, state, *args, **kwargs):
         states.append(state)
-        run.stop(stage, guard.begin(state, run.inherited(stage)), 1)
+        run.record_divergence(stage, nonfinite.begin(state, run.inherited(stage)), 1)
         return state
 
     env = make_envs(config)[0]

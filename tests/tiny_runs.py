@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from taic_jax import pipeline, stage
-from taic_jax.checkpoint import Checkpoints, load_arrays
+from taic_jax import pipeline
 from taic_jax.config import CollectConfig, Config, EvaluateConfig, OptionsConfig, PPOConfig, TrainConfig
-from taic_jax.logging import read_metrics
+from taic_jax.runtime import driver
+from taic_jax.runtime.checkpoint import Checkpoints, load_arrays
+from taic_jax.runtime.logging import read_metrics
 
 PPO = PPOConfig(num_envs=2, rollout_length=8, epochs=1, minibatch_size=16, hidden_sizes=(4,))
 CONFIG = Config(
@@ -53,7 +54,7 @@ def _replace(config: Any, path: list[str], value: Any) -> Any:
 def tiny_steps() -> Iterator[None]:
     """Save a checkpoint at every step, and log every second one."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(stage, "CHECKPOINT_SECONDS", 0.0)
+        patch.setattr(driver, "CHECKPOINT_SECONDS", 0.0)
         patch.setattr(pipeline, "STEPS_PER_LOG", 2)
         yield
 

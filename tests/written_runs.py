@@ -10,11 +10,11 @@ from PIL import Image
 from tiny_runs import CONFIG
 
 from taic_jax.analysis.statistics import summarize
-from taic_jax.artifacts import OPTIONS, describe, save_options
+from taic_jax.artifacts.experience import EXPERIENCE, ExperienceStore
+from taic_jax.artifacts.models import OPTIONS, describe, save_options
 from taic_jax.config import Config
 from taic_jax.config_io import to_yaml
 from taic_jax.envs import make_env
-from taic_jax.experience import EXPERIENCE, ExperienceStore
 from taic_jax.experiments.table import append_row
 from taic_jax.options.dataset import Experience
 from taic_jax.options.model import OptionModel, Scale, init_params, make_networks

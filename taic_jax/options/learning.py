@@ -12,8 +12,8 @@ from jaxtyping import Array, Float, Int, Key
 
 from taic_jax.config import OptionsConfig
 from taic_jax.envs.views import Views
-from taic_jax.guard import earliest, first_nonfinite
 from taic_jax.networks import apply
+from taic_jax.nonfinite import earliest, first_nonfinite
 from taic_jax.options.dataset import Dataset, Experience, Window, gather, make_dataset
 from taic_jax.options.losses import adversarial_loss, end_loss, gradient_reversal, kl_loss, reconstruction_loss
 from taic_jax.options.model import Networks, OptionModel, init_params, make_networks

@@ -7,7 +7,7 @@ import numpy as np
 
 from taic_jax.analysis.statistics import bootstrap_interval, iqm
 from taic_jax.config import COLLECT
-from taic_jax.report.runs import ReportError, RunData, per_seed, read_run
+from taic_jax.report.runs import LoadedRun, ReportError, per_seed, read_run
 
 DIGITS = 5
 """Significant digits of what is drawn."""
@@ -21,14 +21,14 @@ LABELS = {
 }
 
 
-def label_of(run: RunData, stage: str) -> str:
+def label_of(run: LoadedRun, stage: str) -> str:
     """Return what a stage trains, in words."""
     if stage == COLLECT:
         return LABELS["flat"] if run.flat_stage() == COLLECT else "flat PPO (collector)"
     return LABELS.get(stage, stage)
 
 
-def stage_curves(run: RunData, stage: str, points: int) -> dict[str, Any]:
+def stage_curves(run: LoadedRun, stage: str, points: int) -> dict[str, Any]:
     """Return all curves of one stage, ready for JSON.
 
     Args:
@@ -54,7 +54,7 @@ def thinned(count: int, points: int) -> list[int]:
     return np.unique(np.linspace(0, count - 1, min(count, points)).round().astype(int)).tolist()
 
 
-def pretraining(run: RunData, stage: str, above: tuple[str, ...] = ()) -> tuple[int, list[str]]:
+def pretraining(run: LoadedRun, stage: str, above: tuple[str, ...] = ()) -> tuple[int, list[str]]:
     """Return the interactions per seed spent before a stage on what it builds on, and what could not be counted.
 
     Options build on the experience they were learnt from; baseline `transfer` on the source run's policy.
@@ -90,7 +90,7 @@ def _spent_in(name: str, stage: str, above: tuple[str, ...]) -> tuple[int, list[
     return (other.ticks(COLLECT), []) if stage == COLLECT and other.of_stage(COLLECT) else (0, [name])
 
 
-def _over_seeds(values: list[np.ndarray | None], run: RunData) -> dict[str, Any] | None:
+def _over_seeds(values: list[np.ndarray | None], run: LoadedRun) -> dict[str, Any] | None:
     """Return every seed's curve, the interquartile mean and its 95 % interval; None where nothing is a number.
 
     As in the summary, there are no statistics over the other seeds where one has no number.

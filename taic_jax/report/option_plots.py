@@ -10,20 +10,20 @@ import jax.numpy as jnp
 import numpy as np
 
 from taic_jax.analysis.option_space import encode_windows
-from taic_jax.artifacts import OPTIONS, Body, described_body, load_options
-from taic_jax.checkpoint import ArtifactError
+from taic_jax.artifacts.experience import gather_experience
+from taic_jax.artifacts.models import OPTIONS, Body, described_body, load_options
 from taic_jax.config import COLLECT, ConfigError, OptionsConfig
 from taic_jax.config_io import load_config
-from taic_jax.experience import gather_experience
 from taic_jax.networks import apply
 from taic_jax.options.dataset import Experience
 from taic_jax.options.model import OptionModel, make_networks
 from taic_jax.report.curves import rounded
-from taic_jax.report.runs import RunData
+from taic_jax.report.runs import LoadedRun
+from taic_jax.runtime.checkpoint import ArtifactError
 from taic_jax.types import as_arrays
 
 
-def option_plot(run: RunData, count: int) -> dict[str, Any]:
+def option_plot(run: LoadedRun, count: int) -> dict[str, Any]:
     """Return the picture of the first seed's option model, ready for JSON, or why there is none.
 
     The options are the means of q(o|a) over windows drawn from what the model was learnt from, coloured by the change

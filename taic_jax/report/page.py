@@ -10,20 +10,20 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from taic_jax.files import save_text
 from taic_jax.report.curves import stage_curves
 from taic_jax.report.option_plots import option_plot
 from taic_jax.report.results import facts_of, histograms_of, methods_of
 from taic_jax.report.runs import (
     UNTRAINED_STAGES,
+    LoadedRun,
     ReportError,
-    RunData,
     check_seeds,
     default_fields,
     read_run,
     unique_names,
 )
 from taic_jax.report.sweeps import SweepData, is_sweep, read_sweep
+from taic_jax.runtime.files import save_text
 
 SCRIPTS = ("page.js", "charts.js", "scatter.js", "tables.js", "sections.js")
 GENERATOR = '<meta name="generator" content="taic_jax.report">'
@@ -88,7 +88,7 @@ def render(data: dict[str, Any]) -> str:
     return before + "".join(parts[name] + after for name, _, after in pieces)
 
 
-def _read(folders: Sequence[Path]) -> tuple[list[RunData], list[SweepData]]:
+def _read(folders: Sequence[Path]) -> tuple[list[LoadedRun], list[SweepData]]:
     """Read every folder, in the order given; a sweep's points are runs."""
     runs, sweeps = [], []
     for folder, name in zip(folders, unique_names(folders), strict=True):
@@ -103,7 +103,7 @@ def _read(folders: Sequence[Path]) -> tuple[list[RunData], list[SweepData]]:
     return runs, sweeps
 
 
-def _collect_run(run: RunData, detail: Detail) -> dict[str, Any]:
+def _collect_run(run: LoadedRun, detail: Detail) -> dict[str, Any]:
     stages = list(dict.fromkeys(row["stage"] for row in run.rows if row["stage"] not in UNTRAINED_STAGES[:1]))
     plot = option_plot(run, detail.options) if detail.options else {"missing": "left out by --options 0"}
     return {
@@ -120,13 +120,13 @@ def _collect_run(run: RunData, detail: Detail) -> dict[str, Any]:
     }
 
 
-def _video(run: RunData) -> str | None:
+def _video(run: LoadedRun) -> str | None:
     """Return the video as a data URI, or None if there is none."""
     path = run.folder / "video.webp"
     return "data:image/webp;base64," + base64.b64encode(path.read_bytes()).decode() if path.is_file() else None
 
 
-def _differences(runs: Sequence[RunData]) -> list[str]:
+def _differences(runs: Sequence[LoadedRun]) -> list[str]:
     """Tell what keeps runs from being compared number by number."""
     notes = []
     for what, values in (
@@ -141,7 +141,7 @@ def _differences(runs: Sequence[RunData]) -> list[str]:
     return notes
 
 
-def _versions(runs: Sequence[RunData]) -> dict[str, list[str]]:
+def _versions(runs: Sequence[LoadedRun]) -> dict[str, list[str]]:
     """Return for each package the versions the finished runs had."""
     told = [run.summary.get("versions") or {} for run in runs if run.summary]
     names = dict.fromkeys(name for versions in told for name in versions)

@@ -7,13 +7,13 @@ import numpy as np
 from taic_jax.analysis.statistics import summarize
 from taic_jax.config import COLLECT
 from taic_jax.report.curves import label_of, pretraining
-from taic_jax.report.runs import UNTRAINED_STAGES, RunData, per_seed
+from taic_jax.report.runs import UNTRAINED_STAGES, LoadedRun, per_seed
 
 MODES = ("return", "return_mean_option")
 """Returns of the policy as it explores, and of its mean options."""
 
 
-def methods_of(run: RunData) -> list[dict[str, Any]]:
+def methods_of(run: LoadedRun) -> list[dict[str, Any]]:
     """Return a row of the table per method, ready for JSON.
 
     A stage that is evaluated but in no summary (a collector on another task, a run that is not finished) is a row too,
@@ -28,11 +28,11 @@ def methods_of(run: RunData) -> list[dict[str, Any]]:
     return rows
 
 
-def _stage_of(run: RunData, method: str) -> str:
+def _stage_of(run: LoadedRun, method: str) -> str:
     return "train" if method == "taic" else (run.flat_stage() or "flat") if method == "flat" else method
 
 
-def _row(run: RunData, stage: str, told: dict[str, Any]) -> dict[str, Any]:
+def _row(run: LoadedRun, stage: str, told: dict[str, Any]) -> dict[str, Any]:
     ticks, uncounted = pretraining(run, stage)
     return {
         "stage": stage, "label": label_of(run, stage), "task": run.task_of(stage), "evaluated": bool(told),
@@ -52,7 +52,7 @@ def _from_summary(told: dict[str, Any]) -> dict[str, Any]:
     return result
 
 
-def _from_evaluation(run: RunData, stage: str) -> dict[str, Any]:
+def _from_evaluation(run: LoadedRun, stage: str) -> dict[str, Any]:
     """Return what the rows of stage evaluate tell of a stage: no summary holds it."""
     result = {}
     for row in run.of_stage("evaluate"):
@@ -63,7 +63,7 @@ def _from_evaluation(run: RunData, stage: str) -> dict[str, Any]:
     return result
 
 
-def histograms_of(run: RunData) -> list[dict[str, Any]]:
+def histograms_of(run: LoadedRun) -> list[dict[str, Any]]:
     """Return for each method whose options may last longer than a tick the share of those that took 1..L ticks."""
     told = (run.summary or {}).get("methods", {})
     result = []
@@ -82,7 +82,7 @@ def histograms_of(run: RunData) -> list[dict[str, Any]]:
     return result
 
 
-def _last_counts(run: RunData, stage: str) -> np.ndarray | None:
+def _last_counts(run: LoadedRun, stage: str) -> np.ndarray | None:
     """Return how many options took 1..L ticks in the newest iteration, over all seeds."""
     for row in reversed(run.of_stage(stage)):
         counts = row.get(f"{stage}/durations")
@@ -92,7 +92,7 @@ def _last_counts(run: RunData, stage: str) -> np.ndarray | None:
     return None
 
 
-def facts_of(run: RunData) -> dict[str, Any]:
+def facts_of(run: LoadedRun) -> dict[str, Any]:
     """Return what was run, where and at what cost."""
     summary = run.summary or {}
     seconds = summary.get("seconds") or run.clock

@@ -13,7 +13,7 @@ import yaml
 
 from taic_jax.config import COLLECT, Config, ConfigError, walk
 from taic_jax.config_io import closest, load_config
-from taic_jax.logging import Row
+from taic_jax.runtime.logging import Row
 
 UNTRAINED_STAGES = ("evaluate", "learn")
 """Stages of metrics.jsonl in which no policy is trained."""
@@ -24,7 +24,7 @@ class ReportError(ValueError):
 
 
 @dataclasses.dataclass(frozen=True)
-class RunData:
+class LoadedRun:
     """One run, or one point of a sweep.
 
     Attributes:
@@ -83,7 +83,7 @@ class RunData:
         return COLLECT if same and self.of_stage(COLLECT) else None
 
 
-def read_run(folder: Path, name: str = "") -> RunData:
+def read_run(folder: Path, name: str = "") -> LoadedRun:
     """Read one run's folder.
 
     Raises:
@@ -102,11 +102,11 @@ def read_run(folder: Path, name: str = "") -> RunData:
         raise ReportError(f"{folder / 'summary.json'}: expected the summary of a run, with its methods; got another")
     if summary is None and (folder / "summary.json").exists():
         notes += ("summary.json cannot be read: shown as a run that is not finished",)
-    run = RunData(name or folder.name, folder, fields, config, rows, summary, clock, notes)
+    run = LoadedRun(name or folder.name, folder, fields, config, rows, summary, clock, notes)
     return dataclasses.replace(run, notes=notes + _state(run) + _stopped(run))
 
 
-def check_seeds(run: RunData) -> None:
+def check_seeds(run: LoadedRun) -> None:
     """Raise ReportError unless every row of a run holds as many seeds as its config says."""
     for row in run.rows:
         for name, value in row.items():
@@ -197,7 +197,7 @@ def _read_json(path: Path) -> dict[str, Any] | None:
     return found if isinstance(found, dict) else None
 
 
-def _state(run: RunData) -> tuple[str, ...]:
+def _state(run: LoadedRun) -> tuple[str, ...]:
     """Tell how far a run is that left no summary."""
     if run.summary is not None:
         return ()
@@ -209,7 +209,7 @@ def _state(run: RunData) -> tuple[str, ...]:
     return (f"not finished, or still going (no summary.json): stage {stage} is at {done:,}{of} {unit}",)
 
 
-def _stopped(run: RunData) -> tuple[str, ...]:
+def _stopped(run: LoadedRun) -> tuple[str, ...]:
     """Tell which seeds diverged."""
     told = (run.summary or {}).get("stopped") or {}
     notes = [

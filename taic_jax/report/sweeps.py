@@ -8,7 +8,7 @@ from typing import Any
 
 from taic_jax.config import Config
 from taic_jax.config_io import load_config
-from taic_jax.report.runs import ReportError, RunData, read_run
+from taic_jax.report.runs import LoadedRun, ReportError, read_run
 from taic_jax.sweep.axes import configs_of, show
 from taic_jax.sweep.runs import PLAN, TABLE, Plan
 
@@ -31,7 +31,7 @@ def is_sweep(folder: Path) -> bool:
     return (folder / PLAN).is_file()
 
 
-def read_sweep(folder: Path, name: str) -> tuple[SweepData, list[RunData]]:
+def read_sweep(folder: Path, name: str) -> tuple[SweepData, list[LoadedRun]]:
     """Return the table of a sweep, and its begun points as runs.
 
     Raises:
@@ -60,7 +60,7 @@ def read_sweep(folder: Path, name: str) -> tuple[SweepData, list[RunData]]:
     return SweepData(name, axes, plan.optuna or len(plan.points), table, notes), runs
 
 
-def _point(chunk: RunData, config: Config, values: dict[str, Any], index: int, place: int, sweep: str) -> RunData:
+def _point(chunk: LoadedRun, config: Config, values: dict[str, Any], index: int, place: int, sweep: str) -> LoadedRun:
     """Return the part of a chunk that is one point: K of its G K seeds."""
     seeds = slice(place * config.seeds, (place + 1) * config.seeds)
     summary = None if chunk.summary is None else {

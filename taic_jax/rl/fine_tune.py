@@ -14,14 +14,13 @@ import optax
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from taic_jax import normalize
 from taic_jax.config import FineTuneConfig, PPOConfig
 from taic_jax.envs.base import Env
-from taic_jax.guard import earliest, first_nonfinite
 from taic_jax.networks import apply
+from taic_jax.nonfinite import earliest, first_nonfinite
 from taic_jax.options.execution import Decoding, OptionExecutor
-from taic_jax.returns import semi_markov_advantages
-from taic_jax.rl import ppo
+from taic_jax.rl import normalize, ppo
+from taic_jax.rl.returns import semi_markov_advantages
 from taic_jax.rl.rollout import Rollout
 from taic_jax.rl.update import shuffled
 from taic_jax.types import Scalar

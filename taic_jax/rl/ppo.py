@@ -12,15 +12,15 @@ import optax
 from flax import struct
 from jaxtyping import Array, Float, Int, Key
 
-from taic_jax import normalize
 from taic_jax.config import PPOConfig
 from taic_jax.envs.base import Env, State
 from taic_jax.envs.wrappers import AutoReset
-from taic_jax.guard import first_nonfinite
 from taic_jax.networks import Policy, PolicyParams
+from taic_jax.nonfinite import first_nonfinite
 from taic_jax.options.execution import Executor
-from taic_jax.returns import semi_markov_advantages
-from taic_jax.rl.rollout import DecideFn, Rollout, Running, count_durations, rollout, start
+from taic_jax.rl import normalize
+from taic_jax.rl.returns import semi_markov_advantages
+from taic_jax.rl.rollout import DecideFn, Rollout, RolloutCarry, count_durations, rollout, start
 from taic_jax.rl.update import LOSSES, Decisions, Update, make_optimizer, update
 from taic_jax.types import Scalar, as_arrays
 
@@ -32,7 +32,7 @@ class TrainState(struct.PyTreeNode):
     optimizer: optax.OptState
     obs_statistics: normalize.Statistics
     reward_scale: normalize.RewardScale
-    running: Running
+    running: RolloutCarry
     key: Array
     iteration: Array
 

@@ -13,16 +13,16 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float, Key
 
-from taic_jax.devices import over_envs
 from taic_jax.envs.base import Env, State
 from taic_jax.options.execution import Executor
+from taic_jax.runtime.devices import over_envs
 from taic_jax.types import select
 
 DecideFn = Callable[[Array, Array], tuple[Array, Array]]
 """(observations [B, S], standard normal noise [B, D]) -> (options [B, D], log-probabilities [B])."""
 
 
-class Running(struct.PyTreeNode):
+class RolloutCarry(struct.PyTreeNode):
     """What is carried from tick to tick, leading axis B."""
 
     env: State
@@ -54,12 +54,12 @@ class Rollout(struct.PyTreeNode):
     extras: Any
 
 
-def start(env: Env, executor: Executor, num_envs: int, key: Key[Array, ""]) -> Running:
+def start(env: Env, executor: Executor, num_envs: int, key: Key[Array, ""]) -> RolloutCarry:
     """Reset `num_envs` environments; every one of them decides at its first tick."""
     state = jax.vmap(env.reset)(jax.random.split(key, num_envs))
     options = jax.vmap(executor.start)(jnp.zeros((num_envs, executor.option_size)), state.obs)
     zeros, never = jnp.zeros(num_envs), jnp.full(num_envs, jnp.nan, jnp.float32)
-    return Running(state, options, jnp.zeros(num_envs, jnp.int32), jnp.ones(num_envs, bool), zeros, never)
+    return RolloutCarry(state, options, jnp.zeros(num_envs, jnp.int32), jnp.ones(num_envs, bool), zeros, never)
 
 
 def _tick(
@@ -67,9 +67,9 @@ def _tick(
     executor: Executor,
     decide: DecideFn,
     keep: Callable[[State], Any],
-    running: Running,
+    running: RolloutCarry,
     noise: Float[Array, "B Z"],
-) -> tuple[Running, Rollout]:
+) -> tuple[RolloutCarry, Rollout]:
     obs, decision = running.env.obs, running.ended
     chance = noise[:, executor.option_size :]
     option, log_prob = decide(obs, noise[:, : executor.option_size])
@@ -87,7 +87,7 @@ def _tick(
         final_obs=state.final_obs, episode_return=total, extras=keep(state),
     )  # fmt: skip
     last_return = jnp.where(done, total, running.last_return)
-    return Running(state, carry, duration, ended, jnp.where(done, 0.0, total), last_return), tick
+    return RolloutCarry(state, carry, duration, ended, jnp.where(done, 0.0, total), last_return), tick
 
 
 def nothing(state: State) -> None:
@@ -106,11 +106,11 @@ def rollout(
     env: Env,
     executor: Executor,
     decide: DecideFn,
-    running: Running,
+    running: RolloutCarry,
     key: Key[Array, ""],
     length: int,
     keep: Callable[[State], Any] = nothing,
-) -> tuple[Running, Rollout]:
+) -> tuple[RolloutCarry, Rollout]:
     """Run `length` ticks of every environment.
 
     Args:

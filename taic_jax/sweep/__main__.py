@@ -45,18 +45,18 @@ def execute(command: Command) -> int:
     """Sweep, or only print the plan; return the exit code."""
     axes = _check(command)
     if command.cluster and not command.dry_run:
-        from taic_jax.sweep.cluster import connect
+        from taic_jax.sweep.ray_tasks import connect
 
         connect(command.cluster)
     if command.optuna:
         points = []
-        importlib.import_module("taic_jax.sweep.asking")  # without Optuna it is refused here, before a folder is made
+        importlib.import_module("taic_jax.sweep.optuna_study")  # a missing one is refused before a folder is made
     else:
         points = sample(axes, command.samples, command.config.seed) if command.samples else grid(axes)
         configs_of(command.config, points)
-    from taic_jax.compilation import keep_programs
-    from taic_jax.devices import open_devices
     from taic_jax.pipeline import check_run
+    from taic_jax.runtime.devices import open_devices
+    from taic_jax.runtime.program_cache import keep_programs
     from taic_jax.sweep.memory import points_that_fit
     from taic_jax.sweep.runs import TABLE, Plan, run_sweep, sweep_config
 

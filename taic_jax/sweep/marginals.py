@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from taic_jax.files import whole_file
+from taic_jax.runtime.files import whole_file
 from taic_jax.sweep.axes import Axis
 
 

@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import psutil
 
+from taic_jax.artifacts.experience import experience_bytes, num_blocks
 from taic_jax.config import Config, ConfigError, kept_ticks, needs_collect
-from taic_jax.experience import experience_bytes, num_blocks
 from taic_jax.options.dataset import Experience, make_dataset
 from taic_jax.pipeline import over_rows
 from taic_jax.tasks import make_envs

@@ -14,15 +14,15 @@ from typing import Any
 import numpy as np
 
 from taic_jax.analysis.statistics import bootstrap_interval, iqm
+from taic_jax.artifacts.experience import EXPERIENCE
 from taic_jax.config import Config, replace
 from taic_jax.config_io import to_yaml
-from taic_jax.experience import EXPERIENCE
-from taic_jax.files import save_text
-from taic_jax.interruption import DivergedError
-from taic_jax.logging import read_metrics
 from taic_jax.pipeline import run_pipeline
-from taic_jax.population import Population, schedule
-from taic_jax.run_folder import LOCK, RunFolderError, claimed, prepare_folder
+from taic_jax.runtime.files import save_text
+from taic_jax.runtime.logging import read_metrics
+from taic_jax.runtime.pbt import Population, schedule
+from taic_jax.runtime.run_folder import LOCK, RunFolderError, claimed, prepare_folder
+from taic_jax.runtime.signals import DivergedError
 from taic_jax.sweep.axes import Axis, chunks, configs_of, show
 from taic_jax.sweep.marginals import draw_marginals
 
@@ -161,7 +161,7 @@ def _row(plan: Plan, i: int, config: Config, returns: np.ndarray, first: np.ndar
 
 def _on_cluster(work: partial, batch: Sequence[int]) -> Iterator[list[dict[str, Any]]]:
     """Run the chunks of a batch as tasks of the cluster that this process is connected to."""
-    from taic_jax.sweep.cluster import run_tasks
+    from taic_jax.sweep.ray_tasks import run_tasks
 
     config, plan, run_dir, settings = work.args
     settings = dict(settings)
@@ -180,7 +180,7 @@ def _batches(
     if not plan.optuna:
         yield range(len(plan.chunks))
         return
-    from taic_jax.sweep.asking import Study
+    from taic_jax.sweep.optuna_study import Study
 
     study, told = Study(axes, run_dir, config.seed), 0
     chunk = 0

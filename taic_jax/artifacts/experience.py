@@ -1,0 +1,146 @@
+"""Experience: flat PPO's training trajectories, on disk as one file per iteration, bounded in number.
+
+A file holds the newest T ticks of every environment and seed, so a run that is killed loses at most the
+iteration it was in, and a resumed one writes the same files again.
+"""
+
+import json
+import zipfile
+from functools import partial
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Key
+
+from taic_jax.artifacts.demonstrations import read_demonstrations
+from taic_jax.artifacts.models import DESCRIPTION, Body, read_description
+from taic_jax.config import CollectConfig, kept_ticks
+from taic_jax.envs.base import Env
+from taic_jax.options.dataset import Experience
+from taic_jax.options.execution import IdentityExecutor
+from taic_jax.rl import ppo
+from taic_jax.rl.rollout import Rollout
+from taic_jax.runtime.checkpoint import ArtifactError
+from taic_jax.runtime.files import save_text, whole_file, writing
+from taic_jax.types import as_arrays
+
+EXPERIENCE = "experience"
+FIELDS = ("obs", "action", "reward", "done")
+
+
+def as_experience(ticks: Rollout, proprioceptive_size: int) -> Experience:
+    """Keep what option learning needs of a rollout."""
+    done = ticks.terminated | ticks.truncated
+    return Experience(ticks.obs[..., :proprioceptive_size], ticks.action, ticks.reward, done)
+
+
+def collect(config: CollectConfig, env: Env, key: Key[Array, ""]) -> tuple[ppo.Agent, dict[str, Array], Experience]:
+    """Train flat PPO in `env` and keep its ticks, or the newest `config.capacity`; pure, so keys may be vmapped.
+
+    Returns the agent, the metrics of every iteration, and the experience [T, B, ...].
+    """
+    config = as_arrays(config)
+    executor = IdentityExecutor(env.action_size)
+    count = ppo.num_iterations(config.ppo, config.ticks)
+    late = min(num_blocks(config), count)
+    step = partial(_iteration, config, env, executor, count)
+    state, metrics = ppo.init(config.ppo, env, executor, key), []
+    if late < count:  # what is too early to be kept
+        state, (early, _) = jax.lax.scan(partial(step, False), state, None, count - late)
+        metrics.append(early)
+    state, (last, blocks) = jax.lax.scan(partial(step, True), state, None, late)
+    metrics = jax.tree.map(lambda *parts: jnp.concatenate(parts), *metrics, last)
+    experience = jax.tree.map(lambda x: x.reshape((-1, *x.shape[2:])), blocks)
+    return ppo.as_agent(config.ppo, executor, state), metrics, experience
+
+
+def _iteration(
+    config: CollectConfig,
+    env: Env,
+    executor: IdentityExecutor,
+    count: int,
+    keep: bool,
+    state: ppo.TrainState,
+    _: None,
+) -> tuple[ppo.TrainState, tuple[dict[str, Array], Experience | None]]:
+    state, metrics, ticks = ppo.iterate(config.ppo, env, executor, count, state)
+    return state, (metrics, as_experience(ticks, env.proprioceptive_size) if keep else None)
+
+
+def num_blocks(config: CollectConfig) -> int:
+    """Return how many iterations' worth of experience is kept, at least one."""
+    return max(kept_ticks(config) // (config.ppo.num_envs * config.ppo.rollout_length), 1)
+
+
+def experience_bytes(env: Env, ticks: int) -> int:
+    """Return the bytes that `ticks` ticks of experience of one seed take, on disk and in memory."""
+    return ticks * (4 * (env.proprioceptive_size + env.action_size + 1) + 1)
+
+
+class ExperienceStore:
+    """A folder of blocks [K, T, B, ...]; the oldest block goes when `capacity` blocks are there.
+
+    Args:
+      folder: made if missing.
+      capacity: number of blocks kept.
+      description: what the experience is of; saved beside the blocks as JSON.
+    """
+
+    def __init__(self, folder: Path, capacity: int, description: dict):
+        self.folder, self.capacity = folder, capacity
+        with writing(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+        save_text(folder / DESCRIPTION, json.dumps(description, indent=2) + "\n")
+
+    def write(self, iteration: int, block: Experience) -> None:
+        """Save the block of one iteration, whole or not at all, and drop the block that no longer fits.
+
+        Raises:
+          SaveError: it cannot be written.
+        """
+        path = self.folder / f"{iteration:06d}.npz"
+        with whole_file(path) as file:
+            np.savez(file, obs=block.obs, action=block.action, reward=block.reward, done=block.done)
+        with writing(path):
+            (self.folder / f"{iteration - self.capacity:06d}.npz").unlink(missing_ok=True)
+
+
+def read_experience(folder: Path, seed: int) -> Experience:
+    """Return all blocks of one seed in time order: [T, B, ...] NumPy arrays.
+
+    Raises:
+      ArtifactError: if there is no block, or one cannot be read.
+    """
+    paths = sorted(folder.glob("[0-9]*.npz"))
+    if not paths:
+        raise ArtifactError(f"{folder} holds no experience: no file like 000000.npz in it")
+    blocks: dict[str, list[np.ndarray]] = {name: [] for name in FIELDS}
+    for path in paths:
+        try:
+            with path.open("rb") as file, np.load(file, allow_pickle=False) as block:
+                for name in FIELDS:
+                    blocks[name].append(block[name][seed])
+        except (OSError, EOFError, ValueError, KeyError, IndexError, zipfile.BadZipFile) as error:
+            raise ArtifactError(f"{path} is no block of experience with seed {seed}: {error}") from None
+    return Experience(**{name: np.concatenate(arrays) for name, arrays in blocks.items()})
+
+
+def gather_experience(source: Path, env: Env | Body, seeds: int) -> Experience:
+    """Return [K, T, B, ...] of what a run collected, or of demonstrations, for the body of `env`.
+
+    Seed k takes the run's seed k modulo their number; demonstrations are every seed's.
+
+    Raises:
+      ArtifactError: nothing readable is there, or it is of another body.
+    """
+    folder = source / EXPERIENCE if (source / EXPERIENCE).is_dir() else source
+    if not (folder / DESCRIPTION).is_file():
+        if not source.exists() or (source / "config.yaml").is_file():
+            raise ArtifactError(f"{source}: expected a run that collected experience, or demonstrations; got none")
+        demonstrations = read_demonstrations(source, env.proprioceptive_size, env.action_size)
+        return jax.tree.map(lambda x: jnp.broadcast_to(x, (seeds, *x.shape)), demonstrations)
+    description = read_description(folder, "experience", env)
+    columns = [read_experience(folder, seed % description["seeds"]) for seed in range(seeds)]
+    return jax.tree.map(lambda *x: jnp.stack(x), *columns)

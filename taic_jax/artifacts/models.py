@@ -1,0 +1,167 @@
+"""What a run leaves for others: its option models and its flat policies, described so that misuse is refused.
+
+An artifact is a folder: the tree of arrays with leading axis K (one per seed), and `description.json`.
+"""
+
+import json
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from taic_jax.config import OptionsConfig, PPOConfig
+from taic_jax.envs.base import Env
+from taic_jax.networks import PolicyParams
+from taic_jax.options.model import OptionModel, Scale, init_params, make_networks
+from taic_jax.rl import normalize
+from taic_jax.rl.ppo import Agent, Policy
+from taic_jax.runtime.checkpoint import ArtifactError, load_tree, save_tree
+from taic_jax.runtime.files import save_text
+
+OPTIONS, POLICY = "options", "policy"
+DESCRIPTION = "description.json"
+
+# What a frozen option model must agree in with the config that uses it: shapes, and how its parts are read.
+STRUCTURE = (
+    "decoder", "size", "length", "termination", "hidden_size", "mlp_sizes", "decoder_sizes",
+)  # fmt: skip
+
+
+class Body(NamedTuple):
+    """What an artifact says of the environment it was made in: enough to read it without that environment."""
+
+    name: str
+    proprioception: str
+    proprioceptive_size: int
+    action_size: int
+
+
+def described_body(folder: Path) -> Body:
+    """Return the body that an artifact was made for, by its own description.
+
+    Raises:
+      ArtifactError: it has none.
+    """
+    try:
+        told = json.loads((folder / DESCRIPTION).read_text())
+        return Body(told["env"], *(told[name] for name in Body._fields[1:]))
+    except (OSError, ValueError, KeyError, TypeError):
+        raise ArtifactError(f"{folder / DESCRIPTION}: expected the description of an artifact, got none") from None
+
+
+def describe(env: Env | Body) -> dict[str, Any]:
+    """Return what decides whether a body is the same: the name and size of its slice, and its actions."""
+    return {
+        "env": env.name,
+        "proprioception": getattr(env, "proprioception", env.name),
+        "proprioceptive_size": env.proprioceptive_size,
+        "action_size": env.action_size,
+    }
+
+
+def read_description(
+    folder: Path, kind: str, env: Env | Body, structure: dict[str, Any] | None = None
+) -> dict[str, Any]:
+    """Return the description of an artifact, checked to be of the body of `env` and of this structure.
+
+    Raises:
+      ArtifactError: there is none, or it is of another body or structure; the message names the first difference.
+    """
+    try:
+        description = json.loads((folder / DESCRIPTION).read_text())
+    except (OSError, ValueError):
+        raise ArtifactError(f"{folder}: expected a run that got this far, or its {kind}; got none") from None
+    if not isinstance(description, dict) or not isinstance(description.get("seeds"), int):
+        raise ArtifactError(f"{folder / DESCRIPTION}: expected the description of an artifact, got another file")
+    body = {name: value for name, value in describe(env).items() if name != "env"}
+    for name, value in {**body, **(structure or {})}.items():
+        value = list(value) if isinstance(value, tuple) else value
+        if description.get(name) != value:
+            got, why = description.get(name), f"which {env.name} needs" if name in body else "as in this config"
+            raise ArtifactError(f"{folder / DESCRIPTION}: {name}: expected {value!r}, {why}; got {got!r}")
+    return description
+
+
+def save_options(folder: Path, model: OptionModel, env: Env, config: OptionsConfig) -> None:
+    """Save the option models [K] learnt in `env` as the artifact `folder`."""
+    _save(folder, model, describe(env) | _structure(config) | {"seeds": len(model.delta)})
+
+
+def load_options(source: Path, env: Env | Body, config: OptionsConfig, seeds: int) -> OptionModel:
+    """Load option models [seeds] from a run or an artifact; seed k takes the model k modulo their number.
+
+    Raises:
+      ArtifactError: nothing is there, or it was made for another body or with another structure.
+    """
+    folder = source / OPTIONS if (source / OPTIONS).is_dir() else source
+    description = read_description(folder, "option model", env, _structure(config))
+    networks = make_networks(config, env.proprioceptive_size, env.action_size)
+    return _load(folder, description["seeds"], seeds, lambda: _empty_model(networks, config, env))
+
+
+def _structure(config: OptionsConfig) -> dict[str, Any]:
+    return {f"options.{name}": getattr(config, name) for name in STRUCTURE}
+
+
+def _empty_model(networks: Any, config: OptionsConfig, env: Env | Body) -> OptionModel:
+    zeros = jnp.zeros(env.proprioceptive_size)
+    params = init_params(networks, config, jax.random.key(0))
+    return OptionModel(params, Scale(zeros, zeros), Scale(zeros, zeros), jnp.zeros(()))
+
+
+def save_policy(folder: Path, agent: Agent, env: Env) -> None:
+    """Save flat policies [K] with their observation statistics as the artifact `folder`."""
+    description = describe(env) | {
+        "observation_size": env.observation_size,
+        "hidden_sizes": list(agent.policy.hidden_sizes),
+        "seeds": len(agent.params.log_std),
+    }
+    _save(folder, (agent.params, agent.obs_statistics), description)
+
+
+def load_policy(source: Path, env: Env, config: PPOConfig, seeds: int) -> tuple[PolicyParams, normalize.Statistics]:
+    """Load flat policies [seeds] that a run on another task of the same body made, fitted to the observations of `env`.
+
+    Input weights are carried over entry by entry of the proprioceptive slice; the entries that only `env` has get
+    zero weights, and statistics that start afresh.
+
+    Raises:
+      ArtifactError: nothing is there, or it was made for another body or with other layers.
+    """
+    folder = source / POLICY
+    structure = {"hidden_sizes": list(config.hidden_sizes)}
+    description = read_description(folder, "flat policy", env, structure)
+    policy, size = Policy(env.action_size, tuple(config.hidden_sizes)), description["observation_size"]
+
+    def empty() -> tuple[PolicyParams, normalize.Statistics]:
+        return policy.init(jax.random.key(0), size, 0.0), normalize.init((size,))
+
+    params, statistics = _load(folder, description["seeds"], seeds, empty)
+    fit = jax.vmap(lambda p, s: _fit(p, s, env.proprioceptive_size, env.observation_size))
+    return fit(params, statistics)
+
+
+def _fit(
+    params: PolicyParams, statistics: normalize.Statistics, shared: int, size: int
+) -> tuple[PolicyParams, normalize.Statistics]:
+    """Carry the first `shared` of a policy's inputs over to `size` inputs."""
+
+    def widen(layers: dict) -> dict:
+        first = layers["params"]["Dense_0"]
+        kernel = jnp.zeros((size, first["kernel"].shape[1])).at[:shared].set(first["kernel"][:shared])
+        return {"params": {**layers["params"], "Dense_0": {**first, "kernel": kernel}}}
+
+    params = params.replace(actor=widen(params.actor), critic=widen(params.critic))
+    return params, normalize.carry_over(statistics, shared, size)
+
+
+def _save(folder: Path, tree: Any, description: dict[str, Any]) -> None:
+    save_tree(folder, tree)
+    save_text(folder / DESCRIPTION, json.dumps(description, indent=2) + "\n")
+
+
+def _load(folder: Path, saved: int, seeds: int, empty: Any) -> Any:
+    like = jax.tree.map(lambda x: jax.ShapeDtypeStruct((saved, *x.shape), x.dtype), jax.eval_shape(empty))
+    which = jnp.arange(seeds) % saved
+    return jax.tree.map(lambda x: x[which], load_tree(folder, like))

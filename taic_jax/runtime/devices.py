@@ -1,0 +1,149 @@
+"""Many devices: the rows of a program (the seeds of all points), or its environments, over all that JAX sees."""
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, TypeVar
+
+import jax
+import numpy as np
+from jax.sharding import AxisType, Mesh, NamedSharding
+from jax.sharding import PartitionSpec as Spec
+
+from taic_jax.config import Config, ConfigError, Shard
+from taic_jax.envs.physics.mujoco import num_physical_cores
+from taic_jax.runtime.hosts import ALONE, Hosts, join, on_this_host
+from taic_jax.runtime.program_cache import compiler_options
+
+Tree = TypeVar("Tree")
+
+SEEDS, ENVS = "seeds", "envs"
+
+
+@dataclass(frozen=True)
+class Devices:
+    """What `--shard` asks for; `none` leaves every array and program on one device.
+
+    Over `seeds`, each device runs the program on its part of the rows, and nothing is exchanged. Over `envs`, each
+    device has all arrays and does all updates, but rolls out its part of the environments; one exchange a rollout.
+    """
+
+    shard: Shard = "none"
+
+    @cached_property
+    def mesh(self) -> Mesh:
+        """The devices, along one axis with the name of what is split."""
+        return jax.make_mesh((jax.device_count(),), (self.shard,), axis_types=(AxisType.Auto,))
+
+    @property
+    def _spec(self) -> Spec:
+        return Spec(SEEDS) if self.shard == SEEDS else Spec()
+
+    def place(self, rows: Tree) -> Tree:
+        """Return rows where programs take them; the last one is repeated until all devices have as many."""
+        if self.shard == "none":
+            return rows
+        if self.shard == SEEDS:
+            rows = jax.tree.map(self._fill, rows)
+        return self._send(rows, self._spec)
+
+    def take(self, rows: Tree, count: int) -> Tree:
+        """Return the first `count` rows, all but those that `place` added, on one device of every host.
+
+        What is computed with them later, be it a slice, would otherwise run on all devices and exchange what it needs;
+        on a CPU many such small programs at once can take all threads, and then wait for each other for ever.
+        """
+        if jax.process_count() > 1:
+            rows = jax.tree.map(on_this_host, self._send(rows, Spec()))
+        elif self.shard != "none":
+            rows = jax.device_put(rows, jax.local_devices()[0])
+        return jax.tree.map(lambda x: x if len(x) == count else x[:count], rows)
+
+    def compile(self, function: Callable, *args: Any, donate: bool = False) -> Callable:
+        """Compile a function of rows and to rows for arguments that were placed; the first may be given away."""
+        settings: dict[str, Any] = {"donate_argnums": 0 if donate else ()}
+        if self.shard == "none":
+            return jax.jit(function, **settings).lower(*args).compile(compiler_options=compiler_options())
+        if self.shard == SEEDS:
+            spec = self._spec
+            function = jax.shard_map(function, mesh=self.mesh, in_specs=spec, out_specs=spec, check_vma=False)
+        with jax.set_mesh(self.mesh):
+            settings["out_shardings"] = NamedSharding(self.mesh, self._spec)
+            return jax.jit(function, **settings).lower(*args).compile(compiler_options=compiler_options())
+
+    def _send(self, rows: Tree, spec: Spec) -> Tree:
+        sharding = NamedSharding(self.mesh, spec)
+        if jax.process_count() > 1:  # where `device_put` takes only devices of this host
+            return jax.jit(_same, out_shardings=sharding)(rows)
+        return jax.device_put(rows, sharding)
+
+    def _fill(self, x: Any) -> Any:
+        missing = -len(x) % self.mesh.size
+        return x[np.minimum(np.arange(len(x) + missing), len(x) - 1)] if missing else x
+
+
+def _same(rows: Tree) -> Tree:
+    """Return rows as they are; one function for all calls, or each of them would be compiled."""
+    return rows
+
+
+def open_devices(shard: Shard, rows: int, hosts: Hosts = ALONE) -> Shard:
+    """Have JAX take each physical core of a CPU for a device, or fewer where rows want no more; return what to split.
+
+    To be called before anything is computed. A number of devices that JAX was told is kept. Over several hosts, wait
+    for the others.
+
+    Raises:
+      ConfigError: the other hosts cannot be reached.
+    """
+    told = "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
+    if shard != "none" and not told and jax.config.values["jax_num_cpu_devices"] < 1:
+        cores = num_physical_cores()
+        jax.config.update("jax_num_cpu_devices", cores if shard == ENVS else fewest(-(-rows // hosts.count), cores))
+    if hosts.count > 1:
+        join(hosts)
+    if shard == "auto":
+        alone = ENVS if hosts.count > 1 else "none"
+        return SEEDS if min(rows, jax.device_count()) > 1 else alone
+    return shard
+
+
+def fewest(rows: int, cores: int) -> int:
+    """Return the fewest devices, each a core, that have as few rows each as with all cores.
+
+    Of ten rows on eight cores some core has two: then five do, and nobody repeats a row.
+    """
+    return -(-rows // -(-rows // cores))
+
+
+def make_devices(shard: Shard, config: Config) -> Devices:
+    """Return the devices that the rows or the environments of a run are split over.
+
+    Raises:
+      ConfigError: environments do not divide by the devices.
+    """
+    count = jax.device_count()
+    for name, ppo in (("collect", config.collect.ppo), ("train", config.train.ppo)):
+        if shard == ENVS and ppo.num_envs % count:
+            nearest = max(round(ppo.num_envs / count), 1) * count
+            raise ConfigError(
+                f"--shard envs: expected {name}.ppo.num_envs to be a multiple of the {count} devices, "
+                f"got {ppo.num_envs}; the nearest valid value is {nearest}"
+            )
+    return Devices(shard)
+
+
+def over_envs(scan: Callable[[Any, Any], tuple[Any, Any]], num_envs: int) -> Callable[[Any, Any], tuple[Any, Any]]:
+    """Split a scan over ticks, (environments [B], [T, B]) -> ([B], [T, B]), where environments are split.
+
+    The results are on all devices. What does not divide by them, as the episodes of an evaluation, each device does
+    whole.
+    """
+    count = jax.sharding.get_abstract_mesh().shape.get(ENVS)
+    if count is None:
+        return scan
+    axis = None if num_envs % count else ENVS
+    specs = (Spec(axis), Spec(None, axis))
+    split = jax.shard_map(scan, in_specs=specs, out_specs=specs, check_vma=False)
+    return lambda state, inputs: jax.lax.with_sharding_constraint(split(state, inputs), Spec())

@@ -1,0 +1,190 @@
+"""Metrics of a run: one row per log point in metrics.jsonl, TensorBoard events, and progress on standard error.
+
+metrics.jsonl is the record; the events are drawn from it. So when a run resumes, rows after the checkpoint
+are dropped from the one, and the other is drawn again.
+"""
+
+import contextlib
+import json
+import math
+import shutil
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from tensorboardX.proto.event_pb2 import Event  # pyright: ignore[reportAttributeAccessIssue]
+from tensorboardX.record_writer import RecordWriter
+from tensorboardX.summary import histogram_raw, scalar
+
+from taic_jax.runtime.files import save_text, writing
+from taic_jax.runtime.progress import Work, make_display
+
+Row = dict[str, Any]
+Unit = Literal["ticks", "steps"]
+
+
+class RunLogger:
+    """Write what a run measures; a context manager.
+
+    A row of metrics.jsonl holds `stage`, `ticks`, `time` (seconds since the epoch), and each metric as
+    `stage/name`: a number, or a list with one number per seed, or per seed a list of counts. What is not finite
+    is null. Events hold the mean over seeds, and of counts a histogram of them all.
+
+    Args:
+        run_dir: folder of the run; rows that it already holds are kept, but for a half-written last one.
+        quiet: show no progress.
+    """
+
+    def __init__(self, run_dir: Path, *, quiet: bool = False):
+        self._path, self._events_dir = run_dir / "metrics.jsonl", run_dir / "tensorboard"
+        with writing(run_dir):
+            self._events_dir.mkdir(parents=True, exist_ok=True)
+        with writing(self._path):
+            _drop_half_row(self._path)
+        self._open()
+        self._display, self._stage = make_display(quiet), None
+
+    def __enter__(self) -> "RunLogger":
+        self._display.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._display.stop()
+        self._close()
+
+    @contextlib.contextmanager
+    def stage(self, name: str, total: int, done: int = 0) -> Iterator[None]:
+        """Show the progress of a stage of `total` ticks or steps, of which `done` were made before a resume."""
+        self._stage = Work(name, total, done, done)
+        with self._shown(self._stage):
+            yield
+        self._stage = None
+
+    def say(self, text: str) -> None:
+        """Say something once, among the progress."""
+        self._display.say(text)
+
+    def doing(self, text: str) -> contextlib.AbstractContextManager[None]:
+        """Show in the context that a run is at something that has no measure, as in `train: compiling`."""
+        return self._shown(Work(text))
+
+    def log(self, stage: str, count: int, metrics: Mapping[str, Any], unit: Unit = "ticks") -> None:
+        """Write one row.
+
+        Args:
+            stage: name of the stage; each metric is written as `stage/name`.
+            count: interactions, or gradient steps, so far in this stage, per seed.
+            metrics: numbers, or arrays of shape [K] with one number per seed, or [K, L] with how often 1..L occurred.
+            unit: what `count` counts, and its name in the row.
+
+        Raises:
+            SaveError: the row cannot be written.
+        """
+        row: Row = {"stage": stage, unit: count, "time": round(time.time(), 3)}
+        row |= {f"{stage}/{name}": _to_json(value) for name, value in metrics.items()}
+        with writing(self._path):
+            self._file.write(json.dumps(row, allow_nan=False) + "\n")
+            self._file.flush()
+        self._write_events(row)
+        with writing(self._events_dir):
+            self._events.flush()
+        if self._stage is not None:
+            self._advance(self._stage, row, unit)
+
+    def truncate(self, stage: str, count: int) -> None:
+        """Drop the rows of a stage after `count`, which a resumed run will write again; -1 drops them all."""
+        rows = read_metrics(self._path)
+        kept = [row for row in rows if row["stage"] != stage or _count(row) <= count]
+        if len(kept) == len(rows):
+            return
+        self._close()
+        shutil.rmtree(self._events_dir, ignore_errors=True)
+        save_text(self._path, "".join(json.dumps(row) + "\n" for row in kept))
+        self._open()
+        for row in kept:
+            self._write_events(row)
+
+    def _open(self) -> None:
+        with writing(self._path):
+            self._file = self._path.open("a")
+        with writing(self._events_dir):
+            self._events_dir.mkdir(exist_ok=True)
+            # The writer beneath tensorboardX.SummaryWriter, whose thread would die unheard when the disk is full, and
+            # every row from then on wait for it.
+            self._events = RecordWriter(str(self._events_dir / f"events.out.tfevents.{int(time.time())}"))
+            self._events.write(Event(wall_time=time.time(), file_version="brain.Event:2").SerializeToString())
+
+    def _close(self) -> None:
+        try:
+            with writing(self._path):
+                self._file.close()
+        finally:
+            with writing(self._events_dir):
+                self._events.close()
+
+    def _write_events(self, row: Row) -> None:
+        for name, value in row.items():
+            if isinstance(value, list) and value and isinstance(value[0], list):
+                self._write_histogram(name, np.nansum(np.array(value, float), axis=0), row)
+            elif "/" in name and (mean := _mean(value)) is not None:
+                self._write_event(scalar(name, mean), row)
+
+    def _write_histogram(self, name: str, counts: np.ndarray, row: Row) -> None:
+        """Write how often each of 1..L occurred."""
+        values = np.arange(1, len(counts) + 1)
+        total, squares = float(counts @ values), float(counts @ values**2)
+        summary = histogram_raw(
+            name, min=0.5, max=len(counts) + 0.5, num=int(counts.sum()), sum=total, sum_squares=squares,
+            bucket_limits=(values + 0.5).tolist(), bucket_counts=counts.tolist(),
+        )  # fmt: skip
+        self._write_event(summary, row)
+
+    def _write_event(self, summary: Any, row: Row) -> None:
+        with writing(self._events_dir):
+            self._events.write(Event(wall_time=row["time"], step=_count(row), summary=summary).SerializeToString())
+
+    def _advance(self, stage: Work, row: Row, unit: Unit) -> None:
+        stage.done, stage.unit, stage.result = row[unit], unit, _mean(row.get(f"{row['stage']}/return"))
+        stage.seeds = max(len(value) if isinstance(value, list) else 1 for value in row.values())
+        self._display.show(stage)
+
+    @contextlib.contextmanager
+    def _shown(self, work: Work) -> Iterator[None]:
+        self._display.show(work)
+        try:
+            yield
+        finally:
+            self._display.show(None)
+
+
+def read_metrics(path: Path) -> list[Row]:
+    """Read the rows of a metrics.jsonl; a half-written last one is left out."""
+    return [json.loads(line) for line in path.read_text().splitlines(keepends=True) if line.endswith("\n")]
+
+
+def _count(row: Row) -> int:
+    return row["ticks"] if "ticks" in row else row["steps"]
+
+
+def _drop_half_row(path: Path) -> None:
+    """Cut what a killed run left after the last newline."""
+    if path.exists():
+        with path.open("rb+") as file:
+            file.truncate(file.read().rfind(b"\n") + 1)
+
+
+def _to_json(value: Any) -> Any:
+    """Turn a number or an array [K] into numbers that JSON knows; what is not finite becomes None."""
+    numbers = np.asarray(value)
+    if numbers.ndim:
+        return [_to_json(number) for number in numbers]
+    number = numbers.astype(np.float64).item() if numbers.dtype.kind not in "iu" else numbers.item()
+    return number if math.isfinite(number) else None
+
+
+def _mean(value: Any) -> float | None:
+    """Return the mean over the seeds that are finite, or None if none is."""
+    numbers = [number for number in (value if isinstance(value, list) else [value]) if number is not None]
+    return sum(numbers) / len(numbers) if numbers else None

@@ -1,0 +1,116 @@
+"""Population-based training (Jaderberg et al., 2017) over the rows of one program.
+
+Every so many steps the worst quarter of the points takes over what a point of the best quarter has learnt, with its
+numbers perturbed. Each seed has a population of its own, so that seeds stay independent repeats.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from operator import attrgetter
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from taic_jax.config import Config, replace
+from taic_jax.nonfinite import FINITE
+
+SHARE = 4
+"""One in so many points is replaced, and as many are copied."""
+FACTORS = (0.8, 1.25)
+PREFIX, PARENT = "pbt", "pbt/parent"
+
+
+class Members(struct.PyTreeNode):
+    """The rows [G K]: what they have learnt, the numbers they learn with, their own keys, and the steps taken."""
+
+    state: Any
+    config: Config
+    key: Array
+    count: Array
+
+
+@dataclass(frozen=True)
+class Population:
+    """How G points evolve: `bounds` are of each number that is perturbed, by its dotted name in the config."""
+
+    every: int
+    bounds: dict[str, tuple[float, float]]
+    seeds: int
+
+    def begin(self, state: Any, config: Config, key: Key[Array, " R"]) -> Members:
+        """Return the rows before the first step; their randomness has keys apart from those of the stage."""
+        return Members(state, config, jax.vmap(lambda k: jax.random.fold_in(k, 1))(key), jnp.zeros(len(key), jnp.int32))
+
+    def evolving(self, step: Callable[..., tuple[Any, dict, Any]]) -> Callable[..., tuple[Members, dict, Any]]:
+        """Return a step (members, configs, ...) from one (states, configs, ...) whose metrics hold `return`.
+
+        The members' own configs take the place of those given. Metrics tell the numbers that the step was taken with
+        (`pbt/NAME`), and of which row each goes on after it (`pbt/parent`).
+        """
+
+        def call(members: Members, _: Config, *args: Any) -> tuple[Members, dict, Any]:
+            state, metrics, extra = step(members.state, members.config, *args)
+            count = members.count + 1
+            key, key_donor, key_factor = _split(members.key)
+            score = jnp.where(metrics["nonfinite"] == FINITE, metrics["return"], jnp.nan)
+            parent = _parents(score.reshape(-1, self.seeds), key_donor)
+            parent = jnp.where(count % self.every == 0, parent, jnp.arange(len(parent)))
+            told = {f"{PREFIX}/{name}": attrgetter(name)(members.config) for name in self.bounds}
+            after = Members(_take_over(state, parent), self._explore(members.config, parent, key_factor), key, count)
+            return after, metrics | told | {PARENT: parent.astype(jnp.float32)}, extra
+
+        return call
+
+    def _explore(self, config: Config, parent: Int[Array, " R"], key: Key[Array, " R"]) -> Config:
+        """Return the parents' numbers, multiplied by one of the factors where a row has another for its parent."""
+        moved = parent != jnp.arange(len(parent))
+        up = jax.vmap(lambda k: jax.random.bernoulli(k, shape=(len(self.bounds),)))(key)
+        for i, (name, (low, high)) in enumerate(self.bounds.items()):
+            value = attrgetter(name)(config)[parent]
+            perturbed = jnp.clip(value * jnp.where(up[:, i], FACTORS[1], FACTORS[0]), low, high)
+            config = replace(config, name, jnp.where(moved, perturbed, value))
+        return config
+
+
+def _split(key: Key[Array, " R"]) -> tuple[Array, Array, Array]:
+    keys = jax.vmap(lambda k: jax.random.split(k, 3))(key)
+    return keys[:, 0], keys[:, 1], keys[:, 2]
+
+
+def _parents(score: Float[Array, "G K"], key: Key[Array, " R"]) -> Int[Array, " R"]:
+    """Return for each row whose weights it goes on with: its own, or those of a better one of the same seed."""
+    points, seeds = score.shape
+    few = max(points // SHARE, 1)
+    known = jnp.where(jnp.isnan(score), -jnp.inf, score)
+    order = jnp.argsort(-known, axis=0)
+    rank = jnp.argsort(order, axis=0)
+    seed = jnp.broadcast_to(jnp.arange(seeds), score.shape)
+    donor = order[jax.vmap(lambda k: jax.random.randint(k, (), 0, few))(key).reshape(score.shape), seed]
+    worse: Bool[Array, "G K"] = (rank >= points - few) & (known < known[donor, seed])
+    point = jnp.broadcast_to(jnp.arange(points)[:, None], score.shape)
+    return (jnp.where(worse, donor, point) * seeds + seed).reshape(-1)
+
+
+def _take_over(state: Any, parent: Int[Array, " R"]) -> Any:
+    """Return the parents' states, but each row's own keys, or children would draw the same numbers."""
+    return jax.tree.map(lambda x: x if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x[parent], state)
+
+
+def schedule(rows: list[dict[str, Any]], names: list[str], row: int) -> list[tuple[int, dict[str, float]]]:
+    """Return the numbers that the weights of one row were learnt with: (tick from which, by name), as they changed.
+
+    Args:
+      rows: the metrics of stage train, in order.
+      names: of the numbers, dotted.
+      row: of the last one.
+    """
+    found: list[tuple[int, dict[str, float]]] = []
+    for i in reversed(range(len(rows))):
+        row = int(rows[i][f"train/{PARENT}"][row])
+        since = rows[i - 1]["ticks"] if i else 0
+        found.append((since, {name: rows[i][f"train/{PREFIX}/{name}"][row] for name in names}))
+    found.reverse()
+    return [entry for i, entry in enumerate(found) if not i or entry[1] != found[i - 1][1]]

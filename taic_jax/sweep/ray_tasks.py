@@ -1,0 +1,92 @@
+"""Chunks of a sweep as tasks on a Ray cluster, one a node at a time; a task of a lost node goes on on another."""
+
+import logging
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from taic_jax.config import ConfigError
+from taic_jax.envs.errors import MissingExtraError
+from taic_jax.runtime.run_folder import BusyError
+from taic_jax.runtime.signals import Signals
+
+try:
+    import ray  # pyright: ignore[reportMissingImports]
+except ImportError:
+    raise MissingExtraError("ray", "cluster") from None
+
+LOCAL = "local"
+PATIENCE = 15.0
+"""Seconds in which a cluster must answer."""
+RETRIES = 100
+"""How many nodes a task may lose."""
+RELEASE = 60.0
+"""Seconds that a task waits for the process of a lost node to let go of the folder."""
+_PROBE = "import ray, sys; ray.init(sys.argv[1], logging_level='ERROR', log_to_driver=False)"
+
+
+def connect(address: str) -> None:
+    """Connect to a cluster, or start one on this machine where the address is `local`.
+
+    Raises:
+      ConfigError: it does not answer in time, or is of another version.
+    """
+    if address != LOCAL:
+        # In a process of its own: Ray waits for longer, and cannot be told to stop waiting.
+        command = [sys.executable, "-c", _PROBE, address]
+        try:
+            probe = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE)
+        except subprocess.TimeoutExpired:
+            raise ConfigError(_unanswered(address, f"in {PATIENCE:.0f} s")) from None
+        if probe.returncode:
+            last = (probe.stderr.strip().splitlines() or [""])[-1]
+            raise ConfigError(_unanswered(address, f"({last})"))
+    ray.init(address, logging_level=logging.ERROR, namespace="taic_jax")
+
+
+def _unanswered(address: str, how: str) -> str:
+    return (
+        f"--cluster: expected the HOST:PORT of a Ray cluster, got no answer of {address} {how}; {LOCAL} starts one here"
+    )
+
+
+def run_tasks(work: Callable[..., Any], tasks: Sequence[tuple], signals: Signals | None = None) -> Iterator[Any]:
+    """Yield what `work(*task)` returns for each of the tasks, in the order in which they end.
+
+    A task takes a whole node of the smallest kind there is, and runs in this process's folder, which all nodes share.
+    """
+    remote: Any = ray.remote(max_retries=RETRIES, scheduling_strategy="SPREAD", **_smallest_node())(_in_folder)
+    waiting = [remote.remote(Path.cwd(), work, task) for task in tasks]
+    try:
+        while waiting:
+            ended, waiting = ray.wait(waiting, timeout=1.0)
+            if signals:
+                signals.check()
+            for task in ended:
+                yield ray.get(task)
+    finally:
+        for task in waiting:
+            ray.cancel(task, force=True)
+
+
+def _in_folder(folder: Path, work: Callable[..., Any], task: tuple) -> Any:
+    os.chdir(folder)
+    deadline = time.monotonic() + RELEASE
+    while True:
+        try:
+            return work(*task)
+        except BusyError:
+            if time.monotonic() > deadline:
+                raise
+            time.sleep(1.0)
+
+
+def _smallest_node() -> dict[str, Any]:
+    """Return the processors that every node which has any has at least."""
+    nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+    least = {kind: min((node[kind] for node in nodes if node.get(kind)), default=0.0) for kind in ("CPU", "GPU")}
+    return {"num_cpus": least["CPU"], "num_gpus": least["GPU"]}
