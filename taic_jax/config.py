@@ -221,6 +221,15 @@ CONFIG_CLASSES = (
 COLLECT = "collect"
 """This run's own experience, as a name in `options.experience`."""
 
+METHOD_LABELS = {
+    "taic": "options (TAIC)",
+    "flat": "flat PPO",
+    "repeat": "flat PPO, held actions",
+    "total": "flat PPO, ticks of both stages",
+    "transfer": "flat PPO from the source's policy",
+}
+"""The methods of a summary in words: options, and the flat baselines by their names in `train.baselines`."""
+
 
 def kept_ticks(config: CollectConfig) -> int:
     """Return how many ticks of experience stage collect leaves, per seed, but for the rest of an iteration."""

@@ -14,7 +14,7 @@ from rich.table import Table
 from taic_jax.analysis.evaluate import record
 from taic_jax.analysis.statistics import iqm, summarize
 from taic_jax.artifacts.experience import experience_bytes
-from taic_jax.config import COLLECT, Config, collector_is_baseline, kept_ticks, needs_collect
+from taic_jax.config import COLLECT, METHOD_LABELS, Config, collector_is_baseline, kept_ticks, needs_collect
 from taic_jax.envs.base import Env
 from taic_jax.nonfinite import FINITE, QUANTITIES
 from taic_jax.rl.ppo import Agent, num_iterations
@@ -73,13 +73,6 @@ def as_summary(run: Run, methods: Mapping[str, Mapping[str, Any]]) -> dict[str, 
     }
 
 
-NAMES = {
-    "taic": "options (TAIC)", "flat": "flat PPO", "repeat": "flat PPO, actions held",
-    "total": "flat PPO, ticks of both stages", "transfer": "flat PPO from the source's policy",
-}  # fmt: skip
-"""Names of methods as `train.baselines` has them."""
-
-
 def as_table(summary: Mapping[str, Any]) -> Table:
     """Return the returns of a summary, a row a method: interquartile means over seeds, and their 95 % intervals."""
     table = Table("method", box=SIMPLE, title="return of an episode", title_justify="left", title_style="")
@@ -88,7 +81,7 @@ def as_table(summary: Mapping[str, Any]) -> Table:
     for name, method in summary["methods"].items():
         first = iqm(np.array(method["return"]["first_per_seed"], float))
         trained = [_interval(method[mode]) for mode in ("return", "return_mean_option")]
-        table.add_row(NAMES.get(name, name), f"{first:,.0f}", *trained)
+        table.add_row(METHOD_LABELS.get(name, name), f"{first:,.0f}", *trained)
     return table
 
 

@@ -43,3 +43,4 @@ def test_the_version_has_one_home():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
     assert project["project"]["dynamic"] == ["version"] and "version" not in project["project"]
     assert metadata.version("taic-jax") == taic.__version__
+    assert f"\nversion: {taic.__version__}\n" in (ROOT / "CITATION.cff").read_text()

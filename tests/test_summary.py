@@ -50,7 +50,7 @@ def test_the_table_has_a_row_a_method_with_intervals_where_there_are_several_see
     low, high = summarize(seeds)["ci95"]
     assert cells["options (TAIC)"] == ["2", f"2,500 ({low:,.0f} … {high:,.0f})", "5 (5 … 5)"]
     assert cells["flat PPO"] == ["7", "-1,234", "8"]
-    assert cells["flat PPO, actions held"][:2] == ["2", "a seed diverged"]
+    assert cells["flat PPO, held actions"][:2] == ["2", "a seed diverged"]
     assert "trained, as it explores" in cells["method"]
 
 

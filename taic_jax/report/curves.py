@@ -6,19 +6,12 @@ from typing import Any
 import numpy as np
 
 from taic_jax.analysis.statistics import bootstrap_interval, iqm
-from taic_jax.config import COLLECT
+from taic_jax.config import COLLECT, METHOD_LABELS
 from taic_jax.report.runs import LoadedRun, ReportError, per_seed, read_run
 
 DIGITS = 5
 """Significant digits of what is drawn."""
-LABELS = {
-    "train": "options (TAIC)",
-    "flat": "flat PPO",
-    "repeat": "flat PPO, held actions",
-    "total": "flat PPO, ticks of both stages",
-    "transfer": "flat PPO from the source's policy",
-    "learn": "learning of options",
-}
+LABELS = METHOD_LABELS | {"train": METHOD_LABELS["taic"], "learn": "learning of options"}
 
 
 def label_of(run: LoadedRun, stage: str) -> str:

@@ -52,6 +52,15 @@ def expected() -> np.ndarray:
     return np.asarray(states.obs)
 
 
+def test_a_process_without_a_cpu_device_is_not_warned(monkeypatch, capfd):
+    def no_device(backend):
+        raise RuntimeError(f"Unknown backend {backend}")
+
+    monkeypatch.setattr(jax, "local_devices", no_device)
+    assert not host_calls_work.__wrapped__()
+    assert capfd.readouterr().err == ""
+
+
 def test_the_known_answer_is_asked_for_while_a_program_is_traced_too(monkeypatch):
     named = lambda _, function: HostCall("taic_jax_probe_while_traced", function)  # noqa: E731
     monkeypatch.setattr(host_call, "HostCall", named)
