@@ -1,12 +1,15 @@
 """Files that appear under their name when they are whole, and not before, and what is told where that fails."""
 
 import contextlib
+import csv
 import io
+import json
+import math
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 PARTIAL = ".partial"
 """Ending of a file that is not whole yet."""
@@ -71,6 +74,47 @@ def save_text(path: Path, text: str) -> None:
     """
     with whole_file(path) as file:
         file.write(text.encode())
+
+
+def save_json(path: Path, tree: Any) -> None:
+    """Write a tree as indented JSON, whole or not at all.
+
+    Raises:
+        SaveError: it cannot be written.
+        ValueError: a number is not finite (see `json_safe`).
+    """
+    save_text(path, json.dumps(tree, indent=2, allow_nan=False) + "\n")
+
+
+def save_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Write rows with the same columns as CSV, whole or not at all.
+
+    Raises:
+        SaveError: it cannot be written.
+    """
+    text = io.StringIO(newline="")
+    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    save_text(path, text.getvalue())
+
+
+def json_safe(tree: Any, digits: int | None = None) -> Any:
+    """Return a tree of mappings, sequences, arrays and numbers as JSON has them.
+
+    Args:
+        tree: of any depth; what is not finite becomes None.
+        digits: significant digits that floats are rounded to; None keeps them all.
+    """
+    if isinstance(tree, Mapping):
+        return {name: json_safe(item, digits) for name, item in tree.items()}
+    if hasattr(tree, "tolist"):  # an array, or one of its numbers
+        tree = tree.tolist()
+    if isinstance(tree, list | tuple):
+        return [json_safe(item, digits) for item in tree]
+    if isinstance(tree, float):
+        return None if not math.isfinite(tree) else tree if digits is None else float(f"{tree:.{digits}g}")
+    return tree
 
 
 def make_room(folder: Path, size: int) -> None:

@@ -1,21 +1,127 @@
-"""The folder of a run: whose it is, and that nobody else writes in it."""
+"""The folder of a run: its files, whose it is, and that nobody else writes in it."""
 
 import contextlib
+import json
 import shutil
 import tempfile
 import zlib
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, TypedDict
 
 import filelock
 
 from taic_jax.config import COLLECT, Config, walk
 from taic_jax.config_io import load_config, to_yaml
-from taic_jax.runtime.files import PARTIAL, SaveError, remove_partial, save_text, writes_here, writing
+from taic_jax.runtime.files import PARTIAL, SaveError, remove_partial, save_json, save_text, writes_here, writing
 from taic_jax.runtime.hosts import agree
 
 LOCK = ".lock"
 """File of a run's folder that the process at work there has locked."""
+
+
+class Statistics(TypedDict):
+    """A quantity over seeds, as `statistics.summarize` gives it; None stands for what is not finite."""
+
+    per_seed: list[float | None]
+    mean: float | None
+    iqm: float | None
+    ci95: list[float | None]
+
+
+class Returns(Statistics):
+    """Returns after training, and those before it per seed."""
+
+    first_per_seed: list[float | None]
+
+
+class Durations(Statistics):
+    """Mean ticks of an option, and the share of each duration 1..L."""
+
+    histogram: list[float]
+
+
+Method = TypedDict(
+    "Method",
+    {"return": Returns, "return_mean_option": Returns, "duration": Durations, "metrics": dict[str, Statistics]},
+)
+"""The evaluation of one method."""
+
+
+class Summary(TypedDict):
+    """The contents of summary.json."""
+
+    ticks: int
+    ticks_per_second: float | None
+    seconds: dict[str, float]
+    stopped: dict[str, dict[str, dict[str, Any]]]  # stage -> seed -> quantity, after
+    methods: dict[str, Method]
+    versions: dict[str, str | None]
+    commit: str | None
+
+
+Row = dict[str, Any]
+"""A row of metrics.jsonl: `stage`, `ticks` or `steps`, `time`, and each metric, a number or a list over seeds."""
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """The files of one run, by name, and their one reader."""
+
+    path: Path
+
+    @property
+    def config_path(self) -> Path:
+        """The resolved config, written before anything else."""
+        return self.path / "config.yaml"
+
+    @property
+    def metrics_path(self) -> Path:
+        """A row per logged iteration."""
+        return self.path / "metrics.jsonl"
+
+    @property
+    def summary_path(self) -> Path:
+        """The results, written when all stages are done."""
+        return self.path / "summary.json"
+
+    @property
+    def clock_path(self) -> Path:
+        """Seconds and ticks so far."""
+        return self.path / "clock.json"
+
+    @property
+    def begun(self) -> bool:
+        """Whether a run has begun here."""
+        return self.config_path.is_file()
+
+    @property
+    def finished(self) -> bool:
+        """Whether the run has ended."""
+        return self.summary_path.is_file()
+
+    def config(self) -> Config:
+        """Read the config.
+
+        Raises:
+          ConfigError: it is of another version, or none.
+        """
+        return load_config(self.config_path)
+
+    def summary(self) -> Summary:
+        """Read the results of a finished run."""
+        return json.loads(self.summary_path.read_text())
+
+    def metrics(self, stage: str | None = None) -> list[Row]:
+        """Read the rows, of one stage where asked; a half-written last one is left out."""
+        lines = self.metrics_path.read_text().splitlines(keepends=True)
+        rows = [json.loads(line) for line in lines if line.endswith("\n")]
+        return [row for row in rows if stage in (None, row["stage"])]
+
+    def save_summary(self, summary: Summary) -> None:
+        """Write the results; from then on the run is finished."""
+        save_json(self.summary_path, summary)
 
 
 class RunFolderError(ValueError):
