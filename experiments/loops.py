@@ -142,7 +142,7 @@ def learnt_executor(env: envs.Env, ticks: Rollout, config: OptionsConfig) -> Opt
     """
     experience = as_experience(ticks, env.proprioceptive_size)
     model, _ = jax.jit(lambda experience: learn(config, experience, jax.random.key(0)))(experience)
-    return make_executor(config, env.action_size, model)
+    return make_executor(config, model)
 
 
 def options_config(rule: str, decoder: str, steps: int, **changes: Any) -> OptionsConfig:

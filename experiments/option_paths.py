@@ -17,9 +17,8 @@ from taic_jax.artifacts.models import load_options
 from taic_jax.config import COLLECT, OptionsConfig
 from taic_jax.config_io import load_config
 from taic_jax.envs.navigation import MAX_SPEED, Navigation
-from taic_jax.networks import apply
 from taic_jax.options.dataset import gather, make_dataset
-from taic_jax.options.model import OptionModel, make_networks
+from taic_jax.options.model import OptionModel
 from taic_jax.tasks import make_envs
 from taic_jax.types import as_arrays
 
@@ -39,10 +38,8 @@ def as_path(actions: Float[Array, "*batch L 2"]) -> Float[Array, "*batch L+1 2"]
 
 def decode(config: OptionsConfig, model: OptionModel, codes: Float[Array, "N D"]) -> Float[Array, "N L+1 2"]:
     """Return the paths of codes decoded in open loop."""
-    states = jnp.zeros((config.length, model.state_scale.mean.shape[-1]))
-    networks = make_networks(config, states.shape[-1], 2)
-    decoder = partial(apply, networks.decoder, model.params["decoder"])
-    return as_path(jax.vmap(lambda code: decoder(code, states)[0])(codes))
+    states = jnp.zeros((config.length, model.state_size))
+    return as_path(jax.vmap(lambda code: model.decode(code, states)[0])(codes))
 
 
 def straightness(paths: Float[np.ndarray, "N I L 2"]) -> np.ndarray:
@@ -64,8 +61,7 @@ def _draw_windows(
     dataset = make_dataset(experience, config)
     which = jax.random.randint(key, (2 * PAIRS,), 0, dataset.count)
     windows = gather(dataset, which, jnp.full(2 * PAIRS, config.length), config.length)
-    networks = make_networks(config, experience.obs.shape[-1], experience.action.shape[-1])
-    means, _ = jax.vmap(partial(apply, networks.encoder, model.params["encoder"]))(windows.actions)
+    means, _ = jax.vmap(model.encode)(windows.actions)
     return means[:, -1], windows.actions
 
 

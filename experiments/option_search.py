@@ -63,7 +63,7 @@ def score(env: Env, config: Config, experience: Experience, key: jax.Array) -> t
     """Learn options, train over them, and return them and what came out, of one point and seed."""
     key_learn, key_train, key_evaluate = jax.random.split(key, 3)
     model, losses = learn(config.options, experience, key_learn, env.views)
-    executor = make_executor(config.options, env.action_size, model)
+    executor = make_executor(config.options, model)
     first = ppo.as_agent(config.train.ppo, executor, ppo.init(config.train.ppo, env, executor, key_train))
     agent, metrics = ppo.train(config.train.ppo, env, executor, key_train, config.train.ticks)
     told = partial(evaluate, env, key=key_evaluate, episodes=config.evaluate.episodes)

@@ -52,7 +52,7 @@ def example_space(folder: Path) -> dict[str, Any]:
     config = load_config(str(folder / "config.yaml"))
     env, source = make_envs(config)
     model = jax.tree.map(lambda x: x[0], load_options(folder, env, config.options, config.seeds))
-    executor = make_executor(as_arrays(config.options), env.action_size, model)
+    executor = make_executor(as_arrays(config.options), model)
     key_options, key_run = jax.random.split(jax.random.key(config.seed))
     options = jax.random.normal(key_options, (SHOWN, config.options.size))
     effects = jax.jit(option_space.execute, static_argnums=0)(source, executor, options, key_run)

@@ -130,7 +130,7 @@ def steering_of(folder: Path) -> tuple[int, dict[str, np.ndarray]]:
     measured = []
     for seed in range(config.seeds):
         model = jax.tree.map(lambda x, k=seed: x[k], models)
-        executor = make_executor(as_arrays(config.options), env.action_size, model)
+        executor = make_executor(as_arrays(config.options), model)
         measured.append(measure(jax.device_get(walked(executor, jax.random.key(config.seed + seed)))))
     return config.options.length, {name: np.array([row[name] for row in measured]) for name in measured[0]}
 

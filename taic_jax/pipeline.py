@@ -10,6 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from taic_jax.artifacts.experience import EXPERIENCE, ExperienceStore, gather_experience, num_blocks
 from taic_jax.artifacts.models import OPTIONS, POLICY, describe, load_options, load_policy, save_options, save_policy
@@ -29,8 +30,8 @@ from taic_jax.networks import PolicyParams
 from taic_jax.nonfinite import FINITE
 from taic_jax.options import learning
 from taic_jax.options.dataset import Dataset, Experience, holds_out, make_dataset
-from taic_jax.options.execution import IdentityExecutor, make_executor
-from taic_jax.options.model import Networks, OptionModel, make_networks
+from taic_jax.options.learning import LearnState
+from taic_jax.options.model import OptionModel, make_networks
 from taic_jax.rl.normalize import Statistics
 from taic_jax.runtime.devices import make_devices
 from taic_jax.runtime.driver import CLOCK, Clock, Run, drive
@@ -39,7 +40,7 @@ from taic_jax.runtime.logging import RunLogger
 from taic_jax.runtime.run_folder import check_folder, claimed, log_folder, prepare_folder
 from taic_jax.summary import as_summary, write_video
 from taic_jax.tasks import make_envs
-from taic_jax.trainer import FineTuneTrainer, Trained, Trainer
+from taic_jax.trainer import Trained, assess_rows, init_rows, make_trainer, step_rows
 from taic_jax.types import as_rows
 
 STEPS_PER_LOG = 100
@@ -150,68 +151,49 @@ def _train(
     run: Run,
     env: Env,
     stage: str,
-    *model: OptionModel,
+    model: OptionModel | None = None,
+    *,
     after: Callable[[int, Experience], None] | None = None,
     begin: tuple[PolicyParams, Statistics] | None = None,
 ) -> Trained:
     """Train one policy per seed and evaluate it before and after.
 
-    Where it begins from another's policy, that explores afresh: the standard deviation is the config's.
+    A policy that begins from another's explores afresh: the standard deviation is the config's.
     """
-    config, trainer = run.config, make_trainer(run.config, env, stage)
-    init, agent = (over_rows(env, stage, name) for name in ("init", "agent"))
-    state = jax.jit(init)(config, run.stage_keys(stage), *model)
+    trainer, keys = make_trainer(stage, run.config, env, model), run.stage_keys(stage)
+    state = jax.jit(init_rows)(trainer, keys)
     if begin:
         params = begin[0].replace(log_std=state.params.log_std)
         state = state.replace(params=params, obs_statistics=begin[1])
-    place, given = run.devices.place, (config, run.stage_keys("evaluate"))
-    compiled = run.compile(stage, over_rows(env, stage, "assess"), *place((*given, state, *model)))
+    compiled = _compile_rows(run, stage, assess_rows, trainer, run.stage_keys("evaluate"), state)
 
     def assess(state: Any) -> dict:
         with run.logger.doing(f"{stage}: evaluating"):
-            return jax.device_get(run.rows(compiled(*place((*given, state, *model)))))
+            return jax.device_get(compiled(trainer, run.stage_keys("evaluate"), state))
 
     first = assess(state)
-    step, population = step_over_rows(env, stage), run.population if stage == "train" else None
+    step, population = step_rows, run.population if stage == "train" else None
     if population:
-        state, step = population.begin(state, config, run.stage_keys(stage)), population.evolving(step)
+        state, step = population.begin(state, run.config, keys), population.evolving(step)
     state = drive(
-        run, stage, step, state, config, *model,
-        num_steps=trainer.num_steps, unit=trainer.unit, ticks=trainer.unit * len(run.keys), after=after,
+        run, stage, step, state, trainer,
+        num_steps=trainer.num_steps, unit=trainer.unit, ticks=trainer.unit * len(keys), after=after,
     )  # fmt: skip
     state = state.state if population else state
-    last = assess(state)
-    stopped = run.stopped[stage].code != FINITE
-    last = jax.tree.map(lambda x: np.where(stopped.reshape((-1,) + (1,) * (x.ndim - 1)), np.nan, x), last)
+    last = _without_stopped(assess(state), run.stopped[stage].code != FINITE)
     run.logger.log("evaluate", trainer.ticks, {f"{stage}/{name}": x["return"] for name, x in last.items()})
-    return Trained(agent(config, state, *model), first, last)
+    return Trained(jax.vmap(lambda one, state: one.agent(state))(trainer, state), first, last)
 
 
-def over_rows(env: Env, stage: str, method: str) -> Callable[..., Any]:
-    """Return a method of a stage's trainer as a function of rows: (configs, *its arguments)."""
-    return jax.vmap(partial(_call, env, stage, method))
+def _compile_rows(run: Run, stage: str, function: Callable[..., Any], *args: Any) -> Callable[..., Any]:
+    """Compile a function of rows, and return it as one that places its arguments and returns the run's own rows."""
+    compiled = run.compile(stage, function, *run.devices.place(args))
+    return lambda *args: run.rows(compiled(*run.devices.place(args)))
 
 
-def step_over_rows(env: Env, stage: str) -> Callable[..., Any]:
-    """Return a step of a stage's trainer as `drive` takes it: (states, configs, *models)."""
-    step = over_rows(env, stage, "step")
-    return lambda state, config, *model: step(config, state, *model)
-
-
-def _call(env: Env, stage: str, method: str, config: Config, *args: Any) -> Any:
-    return getattr(make_trainer(config, env, stage), method)(*args)
-
-
-def make_trainer(config: Config, env: Env, stage: str) -> Trainer:
-    """Return what a stage trains: a policy over options, or a flat one (see `TrainConfig.baselines`)."""
-    episodes, tune = config.evaluate.episodes, config.train.fine_tune
-    if stage == "train":
-        executor_of = partial(make_executor, config.options, env.action_size)
-        trainer = Trainer(env, config.train.ppo, config.train.ticks, episodes, executor_of)
-        return FineTuneTrainer(**vars(trainer), fine_tune=tune) if tune.epochs else trainer
-    ticks = {"collect": config.collect.ticks, "total": config.collect.ticks + config.train.ticks}
-    executor = IdentityExecutor(env.action_size, config.options.length if stage == "repeat" else 1)
-    return Trainer(env, config.collect.ppo, ticks.get(stage, config.train.ticks), episodes, lambda: executor)
+def _without_stopped(results: Any, stopped: np.ndarray) -> Any:
+    """Return results [K, ...] with NaN for the seeds that stopped."""
+    return jax.tree.map(lambda x: np.where(stopped.reshape((-1,) + (1,) * (x.ndim - 1)), np.nan, x), results)
 
 
 def collect(run: Run, env: Env) -> Trained:
@@ -228,21 +210,25 @@ def collect(run: Run, env: Env) -> Trained:
 def learn(run: Run, env: Env) -> OptionModel:
     """Learn one option model per seed from the experience and save it as the artifact `options`."""
     config, dataset = run.config.options, select_windows(run, env)
-    init, steps = learn_over_rows(config, make_networks(config, env.proprioceptive_size, env.action_size))
-    state = jax.jit(init)(config, run.stage_keys("learn"))
+    state = jax.jit(partial(init_learning, env))(config, run.stage_keys("learn"))
     if config.steps:  # with none, D stays as random as it was drawn
         unit = steps_per_log(config)
-        state = drive(run, "learn", steps, state, config, dataset, num_steps=config.steps // unit, unit=unit)
+        state = drive(run, "learn", learn_rows, state, config, dataset, num_steps=config.steps // unit, unit=unit)
     model = learning.as_model(state, dataset)
     save_options(run.dir / OPTIONS, model, env, config)
     return model
 
 
-def learn_over_rows(config: OptionsConfig, networks: Networks) -> tuple[Callable[..., Any], Callable[..., Any]]:
-    """Return stage learn's (configs, keys) -> states and (states, configs, datasets) -> (states, metrics, None)."""
-    unit = steps_per_log(config) if config.steps else 0
-    init = jax.vmap(lambda config, key: learning.init(config, networks, key))
-    return init, jax.vmap(lambda state, config, dataset: learning.steps(config, networks, unit, state, dataset))
+def init_learning(env: Env, config: OptionsConfig, keys: Array) -> LearnState:
+    """Return the states [K] before the first gradient step, for configs [K]."""
+    networks = make_networks(config, env.proprioceptive_size, env.action_size)
+    return jax.vmap(lambda config, key: learning.init(config, networks, key))(config, keys)
+
+
+def learn_rows(states: LearnState, config: OptionsConfig, dataset: Dataset) -> tuple[LearnState, dict, None]:
+    """Take the gradient steps between two rows of the log, of every row."""
+    unit = steps_per_log(config)
+    return jax.vmap(lambda state, config, data: learning.steps(config, unit, state, data))(states, config, dataset)
 
 
 def steps_per_log(config: OptionsConfig) -> int:
@@ -265,8 +251,8 @@ def select_windows(run: Run, env: Env) -> Dataset:
         else _for_points(gather_experience(Path(name), env, seeds), rows // seeds)
         for name in names
     ]
-    given = run.devices.place((sources, config))
-    dataset = run.rows(run.compile("learn", jax.vmap(partial(make_dataset, views=env.views)), *given)(*given))
+    select = jax.vmap(partial(make_dataset, views=env.views))
+    dataset = _compile_rows(run, "learn", select, sources, config)(sources, config)
     span = f"in {', '.join(names)} between its shares {jnp.min(config.since):g} and {jnp.max(config.until):g}"
     if not dataset.count.all():
         raise ConfigError(

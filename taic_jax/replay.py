@@ -1,6 +1,7 @@
 """Show again how numbers stopped being finite: take the one step that failed from the state that was dumped."""
 
 import json
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -9,15 +10,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from taic_jax.artifacts.models import DESCRIPTION, load_options
+from taic_jax.config import COLLECT
 from taic_jax.config_io import load_config
 from taic_jax.envs.base import Env
 from taic_jax.nonfinite import FINITE, QUANTITIES
-from taic_jax.options.model import make_networks
-from taic_jax.pipeline import learn_over_rows, over_rows, select_windows, step_over_rows
+from taic_jax.pipeline import init_learning, learn_rows, select_windows
 from taic_jax.runtime.checkpoint import ArtifactError, load_tree
 from taic_jax.runtime.driver import Clock, Run
 from taic_jax.runtime.logging import RunLogger
 from taic_jax.tasks import make_envs
+from taic_jax.trainer import init_rows, make_trainer, step_rows
 from taic_jax.types import as_arrays, as_rows
 
 FIELDS = ("stage", "seed", "seeds", "step", "after", "quantity")
@@ -54,17 +56,15 @@ def replay(dump: Path) -> str | None:
 
 
 def _stage(run: Run, env: Env, source: Env, stage: str) -> tuple[Any, Any, tuple]:
-    """Return a stage's step (states, configs, ...), the shapes of its states, and its arguments behind them."""
+    """Return a stage's step (states, *arguments), the shapes of its states, and the arguments."""
     config, keys = run.config, run.stage_keys(stage)
     if stage == "learn":
-        networks = make_networks(config.options, source.proprioceptive_size, source.action_size)
-        init, steps = learn_over_rows(config.options, networks)
-        return steps, jax.eval_shape(init, config.options, keys), (config.options, select_windows(run, source))
-    task = source if stage == "collect" else env
+        states = jax.eval_shape(partial(init_learning, source), config.options, keys)
+        return learn_rows, states, (config.options, select_windows(run, source))
     folder = Path(config.options.source or run.dir)
-    model = (load_options(folder, env, config.options, len(keys)),) if stage == "train" else ()
-    init = over_rows(task, stage, "init")
-    return step_over_rows(task, stage), jax.eval_shape(init, config, keys, *model), (config, *model)
+    model = load_options(folder, env, config.options, len(keys)) if stage == "train" else None
+    trainer = make_trainer(stage, config, source if stage == COLLECT else env, model)
+    return step_rows, jax.eval_shape(init_rows, trainer, keys), (trainer,)
 
 
 def _read(dump: Path) -> dict[str, Any]:

@@ -1,99 +1,136 @@
-"""Training of one policy on one task, for one seed: stages drive it, vmapped over seeds."""
+"""Training of one policy on one task, for one seed: a pytree, so that rows of configs and models are vmapped."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from flax import struct
 from jaxtyping import Array
 
 from taic_jax.analysis.evaluate import evaluate
 from taic_jax.artifacts.experience import as_experience
-from taic_jax.config import FineTuneConfig, PPOConfig
+from taic_jax.config import COLLECT, Config, PPOConfig
 from taic_jax.envs.base import Env
 from taic_jax.options.dataset import Experience
-from taic_jax.options.execution import Executor
+from taic_jax.options.execution import Executor, IdentityExecutor, OptionExecutor, make_executor
 from taic_jax.options.model import OptionModel
 from taic_jax.rl import fine_tune, ppo
 from taic_jax.rl.fine_tune import Tuned
 
 
-@dataclass(frozen=True)
-class Trainer:
-    """Flat control, or a policy over frozen options: the methods are vmapped over keys, states and models.
+class Trainer(struct.PyTreeNode):
+    """Flat PPO, configured by `collect.ppo`; options are actions, each held for `hold` ticks."""
 
-    `executor_of` takes the option model, or nothing where options are actions.
-    """
+    config: Config
+    model: OptionModel | None = None
+    env: Env = struct.field(pytree_node=False, kw_only=True)
+    ticks: int = struct.field(pytree_node=False, kw_only=True)
+    hold: int = struct.field(pytree_node=False, default=1, kw_only=True)
 
-    env: Env
-    config: PPOConfig
-    ticks: int
-    episodes: int
-    executor_of: Callable[..., Executor]
+    @property
+    def settings(self) -> PPOConfig:
+        """How the policy is trained."""
+        return self.config.collect.ppo
+
+    @property
+    def executor(self) -> Executor:
+        """The executor of the policy's options."""
+        return IdentityExecutor(self.env.action_size, self.hold)
 
     @property
     def unit(self) -> int:
         """Ticks of one step."""
-        return self.config.num_envs * self.config.rollout_length
+        return self.settings.num_envs * self.settings.rollout_length
 
     @property
     def num_steps(self) -> int:
-        """How many steps the budget buys."""
+        """How many steps the budget of ticks buys."""
         return self.ticks // self.unit
 
-    def init(self, key: Array, *model: OptionModel) -> Any:
+    def init(self, key: Array) -> Any:
         """Return the state of an untrained policy."""
-        return ppo.init(self.config, self.env, self.executor_of(*model), key)
+        return ppo.init(self.settings, self.env, self.executor, key)
 
-    def step(self, state: Any, *model: OptionModel) -> tuple[Any, dict, Experience | None]:
-        """Run one iteration; return its metrics and its experience."""
-        executor = self.executor_of(*model)
-        state, metrics, rollout = ppo.iterate(self.config, self.env, executor, self.num_steps, state)
-        return state, metrics, as_experience(rollout, self.env.proprioceptive_size)
+    def step(self, state: Any) -> tuple[Any, dict, Experience | None]:
+        """Run one iteration; return the next state, metrics and experience."""
+        state, metrics, ticks, _ = ppo.iterate(self.settings, self.env, self.executor, self.num_steps, state)
+        return state, metrics, as_experience(ticks, self.env.proprioceptive_size)
 
-    def assess(self, key: Array, state: Any, *model: OptionModel) -> dict[str, dict[str, Array]]:
+    def assess(self, key: Array, state: Any) -> dict[str, dict[str, Array]]:
         """Evaluate the policy as it explores, and taking its mean options."""
-        both = partial(evaluate, self.env, self.agent(state, *model), key, self.episodes)
+        both = partial(evaluate, self.env, self.agent(state), key, self.config.evaluate.episodes)
         results = jax.vmap(both)(jnp.array([1.0, 0.0]))
         modes = ("return", "return_mean_option")
         return {mode: jax.tree.map(lambda x, i=i: x[i], results) for i, mode in enumerate(modes)}
 
-    def agent(self, state: Any, *model: OptionModel) -> ppo.Agent:
-        """Return what acts."""
-        return ppo.as_agent(self.config, self.executor_of(*model), state)
+    def agent(self, state: Any) -> ppo.Agent:
+        """Return the policy with its executor, ready to act."""
+        return ppo.as_agent(self.settings, self.executor, state)
 
 
-@dataclass(frozen=True)
-class FineTuneTrainer(Trainer):
-    """A policy over options whose D is fine-tuned on the same ticks."""
+class OptionTrainer(Trainer):
+    """A policy over the options of a frozen model, configured by `train.ppo`."""
 
-    fine_tune: FineTuneConfig
+    @property
+    def settings(self) -> PPOConfig:
+        """How the policy is trained."""
+        return self.config.train.ppo
 
-    def init(self, key: Array, *model: OptionModel) -> tuple[ppo.TrainState, Tuned]:
+    @property
+    def executor(self) -> OptionExecutor:
+        """D and the termination rule."""
+        assert self.model is not None
+        return make_executor(self.config.options, self.model)
+
+
+class FineTuneTrainer(OptionTrainer):
+    """A policy over options whose D is fine-tuned on the same ticks (§5)."""
+
+    def init(self, key: Array) -> tuple[ppo.TrainState, Tuned]:
         """Return the state of an untrained policy, and the learnt D."""
-        executor: Any = self.executor_of(*model)
-        return super().init(key, *model), fine_tune.init(self.config, executor)
+        return super().init(key), fine_tune.init(self.settings, self.executor)
 
-    def step(self, state: Any, *model: OptionModel) -> tuple[Any, dict, None]:
-        """Run one iteration of the policy and of D; return the metrics of both."""
-        learnt: Any = self.executor_of(*model)
-        policy, tuned, metrics = fine_tune.iterate(
-            self.config, self.fine_tune, self.env, learnt, self.num_steps, *state
-        )
+    def step(self, state: Any) -> tuple[Any, dict, None]:
+        """Run one iteration of the policy and of D; return the next states and the metrics of both."""
+        settings = self.settings, self.config.train.fine_tune, self.env, self.executor, self.num_steps
+        policy, tuned, metrics = fine_tune.iterate(*settings, *state)
         return (policy, tuned), metrics, None
 
-    def agent(self, state: Any, *model: OptionModel) -> ppo.Agent:
-        """Return what acts: the policy over the fine-tuned options."""
-        learnt: Any = self.executor_of(*model)
+    def agent(self, state: Any) -> ppo.Agent:
+        """Return the policy over the fine-tuned options."""
         policy, tuned = state
-        return ppo.as_agent(self.config, fine_tune.tuned_executor(learnt, tuned.decoder), policy)
+        return ppo.as_agent(self.settings, fine_tune.tuned_executor(self.executor, tuned.decoder), policy)
+
+
+def make_trainer(stage: str, config: Config, env: Env, model: OptionModel | None = None) -> Trainer:
+    """Return the trainer of a stage: `collect`, `train` over a model's options, or one of `train.baselines`."""
+    if model is not None:
+        kind = FineTuneTrainer if config.train.fine_tune.epochs else OptionTrainer
+        return kind(config, model, env=env, ticks=config.train.ticks)
+    ticks = {COLLECT: config.collect.ticks, "total": config.collect.ticks + config.train.ticks}
+    hold = config.options.length if stage == "repeat" else 1
+    return Trainer(config, env=env, ticks=ticks.get(stage, config.train.ticks), hold=hold)
+
+
+def init_rows(trainer: Trainer, keys: Array) -> Any:
+    """Return the states [K] of untrained policies, of a trainer with leading axis K."""
+    return jax.vmap(lambda one, key: one.init(key))(trainer, keys)
+
+
+def step_rows(states: Any, trainer: Trainer) -> tuple[Any, dict, Any]:
+    """Run one iteration of every row."""
+    return jax.vmap(lambda state, one: one.step(state))(states, trainer)
+
+
+def assess_rows(trainer: Trainer, keys: Array, states: Any) -> dict[str, dict[str, Array]]:
+    """Evaluate every row."""
+    return jax.vmap(lambda one, key, state: one.assess(key, state))(trainer, keys, states)
 
 
 class Trained(NamedTuple):
-    """What training one policy per seed gives, leading axis K."""
+    """A trained policy per seed, leading axis K, and its evaluations before and after training."""
 
     agent: ppo.Agent
-    first: dict[str, dict[str, Array]]  # evaluation of the untrained policy
+    first: dict[str, dict[str, Array]]
     last: dict[str, dict[str, Array]]

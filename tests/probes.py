@@ -10,7 +10,7 @@ from jax import Array
 
 from taic_jax.config import OptionsConfig
 from taic_jax.envs import Env, State
-from taic_jax.options.model import Networks, OptionModel, Scale, init_params, make_networks
+from taic_jax.options.model import OptionModel, Scale, init_params, make_networks
 
 
 class Probe(Env):
@@ -154,13 +154,13 @@ def draw(rng: np.random.Generator, *shape: int) -> jax.Array:
     return jnp.asarray(rng.normal(size=shape), jnp.float32)
 
 
-def random_model(config: OptionsConfig, state_size: int, action_size: int) -> tuple[Networks, OptionModel]:
-    """Return the networks, and an option model whose parameters and scales are drawn at random."""
+def random_model(config: OptionsConfig, state_size: int, action_size: int) -> OptionModel:
+    """Return an option model whose parameters and scales are drawn at random."""
     rng, networks = np.random.default_rng(0), make_networks(config, state_size, action_size)
     shapes = jax.eval_shape(lambda: init_params(networks, config, jax.random.key(0)))
     params = jax.tree.map(lambda leaf: draw(rng, *leaf.shape), shapes)
     scales = [Scale(draw(rng, state_size), jnp.exp(draw(rng, state_size))) for _ in range(2)]
-    return networks, OptionModel(params, *scales, jnp.ones(()))
+    return OptionModel(params, *scales, jnp.ones(()), networks)
 
 
 def numbers(tree: Any) -> list[np.ndarray]:

@@ -30,12 +30,13 @@ from taic_jax.config import Config, ConfigError, TrainConfig
 from taic_jax.config_io import load_config
 from taic_jax.envs import make_env
 from taic_jax.options.dataset import Experience
-from taic_jax.pipeline import over_rows, run_pipeline
+from taic_jax.pipeline import run_pipeline
 from taic_jax.runtime import driver
 from taic_jax.runtime.checkpoint import Checkpoints, load_arrays
 from taic_jax.runtime.logging import RunLogger
 from taic_jax.runtime.run_folder import BusyError, RunFolderError, claimed
 from taic_jax.tasks import make_envs
+from taic_jax.trainer import init_rows, make_trainer
 from taic_jax.types import as_rows
 
 STAGES = {"collect": 3, "learn": 2, "train": 3}
@@ -190,7 +191,7 @@ def test_a_run_repeated_is_the_same_to_the_last_bit(finished, tmp_path):
 def test_a_seed_starts_the_same_alone_among_others_and_in_a_sweep(stage):
     point = with_fields(CONFIG, train__ppo__learning_rate=0.01)
     env, _ = make_envs(CONFIG)
-    init = jax.jit(over_rows(env, stage, "init"))
+    init = jax.jit(lambda rows, keys: init_rows(make_trainer(stage, rows, env), keys))
     keys = jax.vmap(jax.random.key)(jnp.arange(4))
     alone = init(as_rows([CONFIG], 1), keys[3:])
     for row, many in ((3, init(as_rows([CONFIG], 4), keys)), (7, init(as_rows([point, CONFIG], 4), jnp.tile(keys, 2)))):

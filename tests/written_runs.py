@@ -69,7 +69,7 @@ def write_options(folder: Path, config: Config = CONFIG, *, experience: bool = T
     networks = make_networks(options, env.proprioceptive_size, env.action_size)
     ones = jnp.ones(env.proprioceptive_size)
     scale = Scale(0 * ones, ones)
-    model = OptionModel(init_params(networks, options, jax.random.key(0)), scale, scale, jnp.zeros(()))
+    model = OptionModel(init_params(networks, options, jax.random.key(0)), scale, scale, jnp.zeros(()), networks)
     save_options(folder / OPTIONS, jax.tree.map(lambda x: jnp.stack([x, x]), model), env, options)
     if experience:
         obs = np.arange(32.0)[:, None, None] * np.arange(1.0, len(ones) + 1)

@@ -19,10 +19,9 @@ from taic_jax.analysis.measures import (
 from taic_jax.config import OptionsConfig
 from taic_jax.envs.base import Env
 from taic_jax.envs.wrappers import AutoReset
-from taic_jax.networks import apply
 from taic_jax.options.dataset import Experience, gather, make_dataset
 from taic_jax.options.execution import Executor, make_executor
-from taic_jax.options.model import OptionModel, make_networks
+from taic_jax.options.model import OptionModel
 from taic_jax.rl.rollout import rollout, start
 from taic_jax.types import as_arrays
 
@@ -80,7 +79,7 @@ def always(option: Float[Array, "B D"], obs: Float[Array, "B S"], noise: Array) 
 def order(env: Env, config: OptionsConfig, model: OptionModel, key: Key[Array, ""], count: int = 500) -> float:
     """Return the distance correlation of options from the prior and of the change that each causes in one state."""
     key_prior, key_run = jax.random.split(key)
-    executor = make_executor(as_arrays(config), env.action_size, model)
+    executor = make_executor(as_arrays(config), model)
     option = jax.random.normal(key_prior, (count, executor.option_size))
     run = jax.jit(execute, static_argnums=0)  # one program for all models
     effects = jax.device_get(run(env, executor, option, key_run))
@@ -108,10 +107,7 @@ def encode_windows(
     dataset = make_dataset(experience, config)
     which = jax.random.randint(key, (count,), 0, dataset.count)
     windows = gather(dataset, which, jnp.full(count, config.length), config.length)
-    rows = dataset.experience
-    networks = make_networks(config, rows.obs.shape[-1], rows.action.shape[-1])
-    encode = partial(apply, networks.encoder, model.params["encoder"])
-    means, log_stds = jax.vmap(encode)(windows.actions)
+    means, log_stds = jax.vmap(model.encode)(windows.actions)
     return Encoded(means[:, -1], log_stds[:, -1], windows.states[:, 0], windows.states[:, -1])
 
 
@@ -138,7 +134,7 @@ def measure(
     windows = jax.jit(encode_windows, static_argnums=4)(config, model, experience, key_windows, count)
     data = windows.mean + jnp.exp(windows.log_std) * jax.random.normal(key_data, windows.mean.shape)
     prior = jax.random.normal(key_prior, data.shape)
-    executor = make_executor(config, env.action_size, model)
+    executor = make_executor(config, model)
     run = jax.jit(partial(execute, env), static_argnames="many")
     mean = np.asarray(windows.mean)
     kl = kl_per_dimension(mean, np.asarray(windows.log_std))

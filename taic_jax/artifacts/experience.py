@@ -65,7 +65,7 @@ def _iteration(
     state: ppo.TrainState,
     _: None,
 ) -> tuple[ppo.TrainState, tuple[dict[str, Array], Experience | None]]:
-    state, metrics, ticks = ppo.iterate(config.ppo, env, executor, count, state)
+    state, metrics, ticks, _judgement = ppo.iterate(config.ppo, env, executor, count, state)
     return state, (metrics, as_experience(ticks, env.proprioceptive_size) if keep else None)
 
 

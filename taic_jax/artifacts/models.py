@@ -96,18 +96,17 @@ def load_options(source: Path, env: Env | Body, config: OptionsConfig, seeds: in
     """
     folder = source / OPTIONS if (source / OPTIONS).is_dir() else source
     description = read_description(folder, "option model", env, _structure(config))
-    networks = make_networks(config, env.proprioceptive_size, env.action_size)
-    return _load(folder, description["seeds"], seeds, lambda: _empty_model(networks, config, env))
+    return _load(folder, description["seeds"], seeds, lambda: _empty_model(config, env))
 
 
 def _structure(config: OptionsConfig) -> dict[str, Any]:
     return {f"options.{name}": getattr(config, name) for name in STRUCTURE}
 
 
-def _empty_model(networks: Any, config: OptionsConfig, env: Env | Body) -> OptionModel:
-    zeros = jnp.zeros(env.proprioceptive_size)
-    params = init_params(networks, config, jax.random.key(0))
-    return OptionModel(params, Scale(zeros, zeros), Scale(zeros, zeros), jnp.zeros(()))
+def _empty_model(config: OptionsConfig, env: Env | Body) -> OptionModel:
+    networks = make_networks(config, env.proprioceptive_size, env.action_size)
+    params, zeros = init_params(networks, config, jax.random.key(0)), jnp.zeros(env.proprioceptive_size)
+    return OptionModel(params, Scale(zeros, zeros), Scale(zeros, zeros), jnp.zeros(()), networks)
 
 
 def save_policy(folder: Path, agent: Agent, env: Env) -> None:

@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool, Float
 
 from taic_jax.config import OptionsConfig
 from taic_jax.networks import apply
-from taic_jax.options.model import Networks, OptionModel, make_networks
+from taic_jax.options.model import OptionModel
 from taic_jax.options.termination import Termination, make_termination
 
 
@@ -76,14 +76,13 @@ class OptionExecutor(struct.PyTreeNode):
     """D, and the termination rule that ends what D does."""
 
     model: OptionModel
-    networks: Networks = struct.field(pytree_node=False)
     termination: Termination = struct.field(pytree_node=False)
     length: int = struct.field(pytree_node=False)
 
     @property
     def option_size(self) -> int:
         """D."""
-        return self.networks.encoder.option_size
+        return self.model.networks.encoder.option_size
 
     @property
     def noise_size(self) -> int:
@@ -92,35 +91,36 @@ class OptionExecutor(struct.PyTreeNode):
 
     def start(self, option: Float[Array, " D"], obs: Float[Array, " S"]) -> Decoding:
         """Set D's carry from the code."""
-        carry = apply(self.networks.decoder, self.model.params["decoder"], option, method="start")
-        return Decoding(option, carry, self.termination.start(self.networks, self.model, self._state(obs)))
+        carry = self._decoder(option, method="start")
+        return Decoding(option, carry, self.termination.start(self.model, self._state(obs)))
 
     def act(
         self, carry: Decoding, obs: Float[Array, " S"], noise: Array, disturbance: Array | float = 0.0
     ) -> tuple[Decoding, Float[Array, " A"]]:
         """Emit D's next action, disturbed if so asked, clipped to its bounds."""
-        params, state = self.model.params["decoder"], self.model.state_scale(self._state(obs))
-        step = apply(self.networks.decoder, params, carry.carry, carry.option, state, method="step")
-        memory, (action, end_logit) = step
+        state = self.model.state_scale(self._state(obs))
+        memory, (action, end_logit) = self._decoder(carry.carry, carry.option, state, method="step")
         action = jnp.clip(action + disturbance, -1.0, 1.0)
-        followed = self.termination.follow(self.networks, self.model, carry.memory, action, end_logit)
+        followed = self.termination.follow(self.model, carry.memory, action, end_logit)
         return Decoding(carry.option, memory, followed), action
 
     def ended(self, carry: Decoding, obs: Float[Array, " S"], noise: Float[Array, " X"]) -> Bool[Array, ""]:
         """Ask the termination rule."""
-        return self.termination.ended(self.networks, self.model, carry.memory, self._state(obs), noise)
+        return self.termination.ended(self.model, carry.memory, self._state(obs), noise)
 
     def _state(self, obs: Float[Array, " S"]) -> Float[Array, " P"]:
         """Return the proprioceptive slice: an observation may have more entries than the model knows."""
-        return obs[: self.model.state_scale.mean.shape[-1]]
+        return obs[: self.model.state_size]
+
+    def _decoder(self, *args: Any, method: str) -> Any:
+        return apply(self.model.networks.decoder, self.model.params["decoder"], *args, method=method)
 
 
-def make_executor(config: OptionsConfig, action_size: int, model: OptionModel) -> OptionExecutor:
+def make_executor(config: OptionsConfig, model: OptionModel) -> OptionExecutor:
     """Return the executor of an option model under the config's termination rule.
 
     Where delta is P's error itself, the config's is taken, so that it can be swept over one model.
     """
     if config.delta_unit == "error":
         model = model.replace(delta=jnp.asarray(config.delta, jnp.float32))
-    networks = make_networks(config, model.state_scale.mean.shape[-1], action_size)
-    return OptionExecutor(model, networks, make_termination(config), config.length)
+    return OptionExecutor(model, make_termination(config), config.length)

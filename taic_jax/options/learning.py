@@ -12,7 +12,6 @@ from jaxtyping import Array, Float, Int, Key
 
 from taic_jax.config import OptionsConfig
 from taic_jax.envs.views import Views
-from taic_jax.networks import apply
 from taic_jax.nonfinite import earliest, first_nonfinite
 from taic_jax.options.dataset import Dataset, Experience, Window, gather, make_dataset
 from taic_jax.options.losses import adversarial_loss, end_loss, gradient_reversal, kl_loss, reconstruction_loss
@@ -32,6 +31,7 @@ class LearnState(struct.PyTreeNode):
     delta: Array
     key: Array
     step: Array
+    networks: Networks = struct.field(pytree_node=False)
 
 
 def make_optimizer(config: OptionsConfig) -> optax.GradientTransformation:
@@ -51,33 +51,26 @@ def init(config: OptionsConfig, networks: Networks, key: Key[Array, ""]) -> Lear
     key, key_params = jax.random.split(key)
     params = init_params(networks, config, key_params)
     delta = jnp.asarray(config.delta if config.delta_unit == "error" else jnp.inf, jnp.float32)
-    return LearnState(params, make_optimizer(config).init(params), delta, key, jnp.zeros((), jnp.int32))
+    return LearnState(params, make_optimizer(config).init(params), delta, key, jnp.zeros((), jnp.int32), networks)
 
 
 def window_losses(
-    params: dict,
-    networks: Networks,
-    model: OptionModel,
-    config: OptionsConfig,
-    window: Window,
-    noise: Array,
-    disturbance: Array | float = 0.0,
+    model: OptionModel, config: OptionsConfig, window: Window, noise: Array, disturbance: Array | float = 0.0
 ) -> dict[str, Array]:
     """Return the losses of one window and its duration, `noise` [D] drawing every o_i from q(o|a_0..a_i).
 
-    The normalised states that D is told are off by `disturbance` [L, P].
+    The normalised states that D reads are off by `disturbance` [L, P].
 
     The sum E descends is L_recons + lambda_kl L_KL + lambda_pred L_pred - lambda_adv L_adv (and, where D emits an
     end signal, lambda_end times its loss), and F descends L_adv: the reversal in front of F changes the sign on its
     way into E and nowhere else. Under termination predict the window is cut where Algorithm 1 stops, and L_pred is
     the sum over the prefixes up to there; else it is of the whole window.
     """
-    model = model.replace(params=params)
-    means, log_stds = apply(networks.encoder, params["encoder"], window.actions)
+    means, log_stds = model.encode(window.actions)
     last = jnp.sum(window.mask, dtype=jnp.int32) - 1
     mask = window.mask
     if config.termination == "predict":
-        errors = prefix_errors(networks, model, means + jnp.exp(log_stds) * noise[None], window.states)
+        errors = prefix_errors(model, means + jnp.exp(log_stds) * noise[None], window.states)
         last = stop_index(errors, model.delta)
         mask = jnp.arange(len(errors)) <= last
         prediction = jnp.sum(jnp.where(mask, errors, 0.0))
@@ -86,9 +79,9 @@ def window_losses(
     states = model.state_scale(window.states)
     if config.termination != "predict":
         reached = jnp.stack([window.states[0], window.states[last + 1]])
-        prediction = prefix_errors(networks, model, option[None], reached)[0]
-    decoded, end_logit = apply(networks.decoder, params["decoder"], option, states[:-1] + disturbance)
-    estimated = apply(networks.estimator, params["estimator"], gradient_reversal(option, config.lambda_adv))
+        prediction = prefix_errors(model, option[None], reached)[0]
+    decoded, end_logit = model.decode(option, states[:-1] + disturbance)
+    estimated = model.estimate(gradient_reversal(option, config.lambda_adv))
     losses = {
         "reconstruction_loss": reconstruction_loss(decoded, window.actions, mask),
         "kl_loss": kl_loss(mean, log_std),
@@ -100,10 +93,10 @@ def window_losses(
 
 
 def total_loss(
-    params: dict, networks: Networks, model: OptionModel, config: OptionsConfig, windows: Window, *noise: Array
+    params: dict, model: OptionModel, config: OptionsConfig, windows: Window, *noise: Array
 ) -> tuple[Float[Array, ""], dict[str, Array]]:
     """Return the weighted sum over N windows and the mean of each loss; `noise` is the codes', then the states'."""
-    one = partial(window_losses, params, networks, model, config)
+    one = partial(window_losses, model.replace(params=params), config)
     losses = jax.tree.map(jnp.mean, jax.vmap(one)(windows, *noise))
     total = (
         losses["reconstruction_loss"]
@@ -115,30 +108,26 @@ def total_loss(
     return total, losses
 
 
-def step(
-    config: OptionsConfig, networks: Networks, dataset: Dataset, state: LearnState
-) -> tuple[LearnState, dict[str, Array]]:
+def step(config: OptionsConfig, dataset: Dataset, state: LearnState) -> tuple[LearnState, dict[str, Array]]:
     """Take one gradient step on a batch of windows drawn at random from the selection."""
     key, key_windows, key_option, key_delta = jax.random.split(state.key, 4)
     if config.termination == "predict" and config.delta_unit == "quantile":
-        state = state.replace(delta=_measure_delta(config, networks, dataset, state, key_delta))
+        state = state.replace(delta=_measure_delta(config, dataset, state, key_delta))
     windows = _draw(config, dataset, key_windows, jnp.zeros((), jnp.int32), dataset.count)
     noise = [jax.random.normal(key_option, (config.batch_size, config.size))]
     if config.decoder == "closed":
         key_states = jax.random.fold_in(key_option, 1)  # what else is drawn stays as it was before there was this noise
         noise.append(config.state_noise * jax.random.normal(key_states, windows.states[:, :-1].shape))
     model = as_model(state, dataset)
-    gradient, losses = jax.grad(total_loss, has_aux=True)(state.params, networks, model, config, windows, *noise)
+    gradient, losses = jax.grad(total_loss, has_aux=True)(state.params, model, config, windows, *noise)
     with jax.numpy_dtype_promotion("standard"):  # Optax raises a float to an integer power
         updates, optimizer = make_optimizer(config).update(gradient, state.optimizer)
     params: Any = optax.apply_updates(state.params, updates)
     nonfinite = first_nonfinite(
         window=(windows.states, windows.actions), loss=list(losses.values()), gradient=(params, optimizer)
     )
-    losses = losses | {"nonfinite": nonfinite}
-    if config.termination == "predict":
-        losses = losses | {"delta": state.delta}
-    return LearnState(params, optimizer, state.delta, key, state.step + 1), losses
+    losses = losses | {"nonfinite": nonfinite} | ({"delta": state.delta} if config.termination == "predict" else {})
+    return state.replace(params=params, optimizer=optimizer, key=key, step=state.step + 1), losses
 
 
 def _draw(
@@ -155,34 +144,30 @@ def _draw(
     return gather(dataset, which, ticks, config.length, view)
 
 
-def _measure_delta(
-    config: OptionsConfig, networks: Networks, dataset: Dataset, state: LearnState, key: Key[Array, ""]
-) -> Float[Array, ""]:
+def _measure_delta(config: OptionsConfig, dataset: Dataset, state: LearnState, key: Key[Array, ""]) -> Float[Array, ""]:
     """Return the quantile `config.delta` of P's errors on held-out windows, averaged over the latest steps.
 
     Without any such window it is NaN, which no error reaches.
     """
     windows = _draw(config, dataset, key, dataset.count, dataset.held_out)
     model = as_model(state, dataset)
-    encode = partial(apply, networks.encoder, state.params["encoder"])
-    errors = partial(prefix_errors, networks, model)
-    measured = jax.vmap(lambda window: errors(encode(window.actions)[0], window.states))(windows)
+    measured = jax.vmap(lambda window: prefix_errors(model, model.encode(window.actions)[0], window.states))(windows)
     quantile = jnp.where(dataset.held_out > 0, jnp.quantile(measured, config.delta), jnp.nan)
     return jnp.where(state.step == 0, quantile, state.delta + (quantile - state.delta) / DELTA_MEMORY)
 
 
 def steps(
-    config: OptionsConfig, networks: Networks, count: int, state: LearnState, dataset: Dataset
+    config: OptionsConfig, count: int, state: LearnState, dataset: Dataset
 ) -> tuple[LearnState, dict[str, Array], None]:
     """Take `count` gradient steps and return the mean losses, and the earliest of the codes `nonfinite`."""
-    state, losses = jax.lax.scan(lambda s, _: step(config, networks, dataset, s), state, None, count)
+    state, losses = jax.lax.scan(lambda s, _: step(config, dataset, s), state, None, count)
     nonfinite = earliest(losses.pop("nonfinite"))
     return state, jax.tree.map(jnp.mean, losses) | {"nonfinite": nonfinite}, None
 
 
 def as_model(state: LearnState, dataset: Dataset) -> OptionModel:
     """Return the option model learnt so far."""
-    return OptionModel(state.params, dataset.state_scale, dataset.change_scale, state.delta)
+    return OptionModel(state.params, dataset.state_scale, dataset.change_scale, state.delta, state.networks)
 
 
 def learn(
@@ -206,6 +191,5 @@ def learn(
     dataset = make_dataset(experience, config, views)
     rows = dataset.experience
     networks = make_networks(config, rows.obs.shape[-1], rows.action.shape[-1])
-    state = init(config, networks, key)
-    state, losses = jax.lax.scan(lambda s, _: step(config, networks, dataset, s), state, None, config.steps)
+    state, losses = jax.lax.scan(lambda s, _: step(config, dataset, s), init(config, networks, key), None, config.steps)
     return as_model(state, dataset), losses

@@ -1,4 +1,4 @@
-"""The four networks of the option model: E, D, P, F (figure 2). Unbatched; the caller vmaps."""
+"""The option model and its four networks: E, D, P, F (figure 2). Unbatched; the caller vmaps."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -10,7 +10,7 @@ from flax import struct
 from jaxtyping import Array, Float, Int, Key
 
 from taic_jax.config import OptionsConfig
-from taic_jax.networks import MLP
+from taic_jax.networks import MLP, apply
 
 Carry = tuple[Array, Array]
 
@@ -176,15 +176,43 @@ class Scale(struct.PyTreeNode):
 
 
 class OptionModel(struct.PyTreeNode):
-    """What `learn` makes and `train` uses: parameters, the scales of states and state changes, and delta [].
+    """E, D, P and F with their parameters, and the scales of states and state changes.
 
-    `delta` is the error of P at which termination predict ends an option.
+    `delta` [] is the error of P at which termination predict ends an option.
     """
 
     params: dict
     state_scale: Scale
     change_scale: Scale
     delta: Array
+    networks: Networks = struct.field(pytree_node=False)
+
+    @property
+    def state_size(self) -> int:
+        """P."""
+        return self.state_scale.mean.shape[-1]
+
+    def encode(self, actions: Float[Array, "L A"]) -> tuple[Float[Array, "L D"], Float[Array, "L D"]]:
+        """Return mean and log standard deviation of q(o|a_0..a_i) for each i."""
+        return apply(self.networks.encoder, self.params["encoder"], actions)
+
+    def decode(
+        self, option: Float[Array, " D"], states: Float[Array, "L P"]
+    ) -> tuple[Float[Array, "L A"], Float[Array, " L"]]:
+        """Return D's actions and end logits at normalised states, which a D in open loop only counts."""
+        return apply(self.networks.decoder, self.params["decoder"], option, states)
+
+    def predict(self, state: Float[Array, " P"], option: Float[Array, " D"]) -> Float[Array, " P"]:
+        """Return the normalised change of a normalised state under an option."""
+        return apply(self.networks.predictor, self.params["predictor"], state, option)
+
+    def estimate(self, option: Float[Array, " D"]) -> Float[Array, "2 P"]:
+        """Return F's estimate of the normalised start and end state."""
+        return apply(self.networks.estimator, self.params["estimator"], option)
+
+    def with_decoder(self, params: Any) -> "OptionModel":
+        """Return the model with other parameters of D."""
+        return self.replace(params={**self.params, "decoder": params})
 
 
 def make_networks(config: OptionsConfig, state_size: int, action_size: int) -> Networks:

@@ -4,6 +4,7 @@ A rule is what the executor asks after every tick. What it must remember of the 
 """
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Protocol, runtime_checkable
 
 import jax
@@ -14,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 from taic_jax.config import OptionsConfig
 from taic_jax.networks import apply
 from taic_jax.options.losses import prediction_loss
-from taic_jax.options.model import Carry, Networks, OptionModel
+from taic_jax.options.model import Carry, OptionModel
 from taic_jax.types import Scalar
 
 
@@ -28,11 +29,11 @@ def stop_index(errors: Float[Array, " L"], delta: Scalar) -> Int[Array, ""]:
 
 
 def prefix_errors(
-    networks: Networks, model: OptionModel, options: Float[Array, "L D"], states: Float[Array, "L+1 P"]
+    model: OptionModel, options: Float[Array, "L D"], states: Float[Array, "L+1 P"]
 ) -> Float[Array, " L"]:
     """Return L_pred of every prefix of a window: the error of P(s_0, o_i) on s_{i+1} (Algorithm 1, lines 3-5)."""
     start = model.state_scale(states[0])
-    predicted = jax.vmap(lambda o: apply(networks.predictor, model.params["predictor"], start, o))(options)
+    predicted = jax.vmap(partial(model.predict, start))(options)
     return jax.vmap(prediction_loss)(predicted, model.change_scale(states[1:] - states[:1]))
 
 
@@ -45,19 +46,15 @@ class Termination(Protocol):
         """X."""
         ...
 
-    def start(self, networks: Networks, model: OptionModel, state: Float[Array, " P"]) -> Any:
+    def start(self, model: OptionModel, state: Float[Array, " P"]) -> Any:
         """Return the memory of an option that begins in this state."""
         ...
 
-    def follow(
-        self, networks: Networks, model: OptionModel, memory: Any, action: Float[Array, " A"], end_logit: Array
-    ) -> Any:
+    def follow(self, model: OptionModel, memory: Any, action: Float[Array, " A"], end_logit: Array) -> Any:
         """Return the memory after D emitted an action and an end logit."""
         ...
 
-    def ended(
-        self, networks: Networks, model: OptionModel, memory: Any, state: Float[Array, " P"], noise: Array
-    ) -> Bool[Array, ""]:
+    def ended(self, model: OptionModel, memory: Any, state: Float[Array, " P"], noise: Array) -> Bool[Array, ""]:
         """Return whether the option ends in the state after the tick."""
         ...
 
@@ -68,17 +65,13 @@ class Fixed:
 
     noise_size: int = 0
 
-    def start(self, networks: Networks, model: OptionModel, state: Float[Array, " P"]) -> None:
+    def start(self, model: OptionModel, state: Float[Array, " P"]) -> None:
         """Remember nothing."""
 
-    def follow(
-        self, networks: Networks, model: OptionModel, memory: None, action: Float[Array, " A"], end_logit: Array
-    ) -> None:
+    def follow(self, model: OptionModel, memory: None, action: Float[Array, " A"], end_logit: Array) -> None:
         """Remember nothing."""
 
-    def ended(
-        self, networks: Networks, model: OptionModel, memory: None, state: Float[Array, " P"], noise: Array
-    ) -> Bool[Array, ""]:
+    def ended(self, model: OptionModel, memory: None, state: Float[Array, " P"], noise: Array) -> Bool[Array, ""]:
         """Never end early."""
         return jnp.zeros((), bool)
 
@@ -92,19 +85,17 @@ class Output:
 
     noise_size: int
 
-    def start(self, networks: Networks, model: OptionModel, state: Float[Array, " P"]) -> Float[Array, ""]:
+    def start(self, model: OptionModel, state: Float[Array, " P"]) -> Float[Array, ""]:
         """Remember no signal yet."""
         return jnp.zeros(())
 
     def follow(
-        self, networks: Networks, model: OptionModel, memory: Array, action: Float[Array, " A"], end_logit: Array
+        self, model: OptionModel, memory: Array, action: Float[Array, " A"], end_logit: Array
     ) -> Float[Array, ""]:
         """Remember the logit."""
         return end_logit
 
-    def ended(
-        self, networks: Networks, model: OptionModel, memory: Array, state: Float[Array, " P"], noise: Array
-    ) -> Bool[Array, ""]:
+    def ended(self, model: OptionModel, memory: Array, state: Float[Array, " P"], noise: Array) -> Bool[Array, ""]:
         """End with the signal's probability, or where it is above one half."""
         if not self.noise_size:
             return memory > 0.0
@@ -125,24 +116,20 @@ class Predict:
 
     noise_size: int = 0
 
-    def start(self, networks: Networks, model: OptionModel, state: Float[Array, " P"]) -> Following:
+    def start(self, model: OptionModel, state: Float[Array, " P"]) -> Following:
         """Remember the state the option began in."""
-        return Following(state, networks.encoder.start(), jnp.zeros(networks.encoder.option_size))
+        return Following(state, model.networks.encoder.start(), jnp.zeros(model.networks.encoder.option_size))
 
-    def follow(
-        self, networks: Networks, model: OptionModel, memory: Following, action: Float[Array, " A"], end_logit: Array
-    ) -> Following:
+    def follow(self, model: OptionModel, memory: Following, action: Float[Array, " A"], end_logit: Array) -> Following:
         """Let E read the action."""
         params = model.params["encoder"]
-        carry, (option, _) = apply(networks.encoder, params, memory.carry, action, method="step")
+        carry, (option, _) = apply(model.networks.encoder, params, memory.carry, action, method="step")
         return memory.replace(carry=carry, option=option)
 
-    def ended(
-        self, networks: Networks, model: OptionModel, memory: Following, state: Float[Array, " P"], noise: Array
-    ) -> Bool[Array, ""]:
+    def ended(self, model: OptionModel, memory: Following, state: Float[Array, " P"], noise: Array) -> Bool[Array, ""]:
         """End where the error of P(s_0, o_i) on the state reached is at least delta."""
         states = jnp.stack([memory.start, state])
-        return prefix_errors(networks, model, memory.option[None], states)[0] >= model.delta
+        return prefix_errors(model, memory.option[None], states)[0] >= model.delta
 
 
 def make_termination(config: OptionsConfig) -> Termination:

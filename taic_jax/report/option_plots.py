@@ -14,9 +14,8 @@ from taic_jax.artifacts.experience import gather_experience
 from taic_jax.artifacts.models import OPTIONS, Body, described_body, load_options
 from taic_jax.config import COLLECT, ConfigError, OptionsConfig
 from taic_jax.config_io import load_config
-from taic_jax.networks import apply
 from taic_jax.options.dataset import Experience
-from taic_jax.options.model import OptionModel, make_networks
+from taic_jax.options.model import OptionModel
 from taic_jax.report.curves import rounded
 from taic_jax.report.runs import LoadedRun
 from taic_jax.runtime.checkpoint import ArtifactError
@@ -88,9 +87,8 @@ def _encoded(
 
 def _drawn(config: OptionsConfig, model: OptionModel, body: Body, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Return codes [N, D] drawn from the prior and the changes [N, P] that P predicts from the mean state."""
-    networks = make_networks(config, body.proprioceptive_size, body.action_size)
     option = jax.random.normal(jax.random.key(0), (count, config.size))
-    predict = partial(apply, networks.predictor, model.params["predictor"], jnp.zeros(body.proprioceptive_size))
+    predict = partial(model.predict, jnp.zeros(model.state_size))
     change = np.asarray(jax.vmap(predict)(option)) * np.asarray(model.change_scale.std)
     return np.asarray(option), change + np.asarray(model.change_scale.mean)
 

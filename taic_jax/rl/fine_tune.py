@@ -19,10 +19,11 @@ from taic_jax.envs.base import Env
 from taic_jax.networks import apply
 from taic_jax.nonfinite import earliest, first_nonfinite
 from taic_jax.options.execution import Decoding, OptionExecutor
-from taic_jax.rl import normalize, ppo
-from taic_jax.rl.returns import semi_markov_advantages
+from taic_jax.options.model import OptionModel
+from taic_jax.rl import ppo
+from taic_jax.rl.returns import Judgement, semi_markov_advantages
 from taic_jax.rl.rollout import Rollout
-from taic_jax.rl.update import shuffled
+from taic_jax.rl.update import descend, make_optimizer, shuffled
 from taic_jax.types import Scalar
 
 
@@ -52,7 +53,7 @@ class NoisyExecutor(struct.PyTreeNode):
     @property
     def noise_size(self) -> int:
         """How many standard normal numbers a tick takes: those of the inner executor, then one per action."""
-        return self.inner.noise_size + self.inner.networks.decoder.action_size
+        return self.inner.noise_size + self.inner.model.networks.decoder.action_size
 
     def start(self, option: Float[Array, " D"], obs: Float[Array, " S"]) -> Decoding:
         """Start the inner executor."""
@@ -78,11 +79,6 @@ class Actions(struct.PyTreeNode):
     advantage: Array
 
 
-def make_optimizer(config: PPOConfig) -> optax.GradientTransformation:
-    """Return Adam behind global-norm clipping for D's parameters; the step size is applied by `_epoch`."""
-    return optax.flatten(optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.scale_by_adam(eps=1e-5)))
-
-
 def init(config: PPOConfig, executor: OptionExecutor) -> Tuned:
     """Return the learnt D, and an optimiser that has done nothing yet."""
     decoder = executor.model.params["decoder"]
@@ -91,8 +87,7 @@ def init(config: PPOConfig, executor: OptionExecutor) -> Tuned:
 
 def tuned_executor(executor: OptionExecutor, decoder: Any) -> OptionExecutor:
     """Return the executor with another D."""
-    params = {**executor.model.params, "decoder": decoder}
-    return executor.replace(model=executor.model.replace(params=params))
+    return executor.replace(model=executor.model.with_decoder(decoder))
 
 
 def fill_options(option: Float[Array, "T B D"], decision: Bool[Array, "T B"], first: Float[Array, "B D"]) -> Array:
@@ -107,18 +102,21 @@ def fill_options(option: Float[Array, "T B D"], decision: Bool[Array, "T B"], fi
 
 
 def mean_action(
-    executor: OptionExecutor, decoder: Any, option: Float[Array, " D"], state: Float[Array, " P"], tick: Int[Array, ""]
+    model: OptionModel, length: int, option: Float[Array, " D"], state: Float[Array, " P"], tick: Int[Array, ""]
 ) -> Float[Array, " A"]:
-    """Return D's output at the option's `tick`-th action, counted from 0, in this normalised state."""
-    return apply(executor.networks.decoder, decoder, option, state, tick, executor.length, method="at")
+    """Return D's output at the option's `tick`-th action of `length`, counted from 0, in this normalised state."""
+    return apply(model.networks.decoder, model.params["decoder"], option, state, tick, length, method="at")
 
 
 def decoder_loss(
-    decoder: Any, learnt: Any, executor: OptionExecutor, batch: Actions, config: PPOConfig, fine: FineTuneConfig
+    decoder: Any, executor: OptionExecutor, batch: Actions, config: PPOConfig, fine: FineTuneConfig
 ) -> tuple[Float[Array, ""], tuple[Array, Array]]:
-    """Return PPO's clipped loss of M actions plus the weighted KL to the learnt D, and both terms."""
-    means = jax.vmap(partial(mean_action, executor, decoder))(batch.option, batch.state, batch.duration)
-    anchors = jax.vmap(partial(mean_action, executor, learnt))(batch.option, batch.state, batch.duration)
+    """Return PPO's clipped loss of M actions plus the weighted KL to the executor's D, and both terms."""
+    tuned, learnt = executor.model.with_decoder(decoder), executor.model
+    means, anchors = (
+        jax.vmap(partial(mean_action, model, executor.length))(batch.option, batch.state, batch.duration)
+        for model in (tuned, learnt)
+    )
     ratio = jnp.exp(_log_prob(batch.action, means, fine.std) - batch.log_prob)
     clipped = jnp.clip(ratio, 1.0 - config.clip, 1.0 + config.clip)
     surrogate = -jnp.mean(jnp.minimum(ratio * batch.advantage, clipped * batch.advantage))
@@ -154,12 +152,12 @@ def iterate(
     Returns the next state, D, and the metrics of both.
     """
     noisy = NoisyExecutor(tuned_executor(executor, tuned.decoder), fine.std)
-    after, metrics, ticks = ppo.iterate(config, env, noisy, num_iterations, state)
-    rows = _rows(config, fine, noisy, state, ticks, after.running.env.obs)
+    after, metrics, ticks, judgement = ppo.iterate(config, env, noisy, num_iterations, state)
+    rows = _rows(config, noisy, state.running.option.option, ticks, judgement)
     learning_rate = ppo.step_size(config, fine.learning_rate, state.iteration, num_iterations)
-    step = partial(_epoch, config, fine, learning_rate, executor, executor.model.params["decoder"], rows)
+    epoch = partial(_epoch, config, fine, learning_rate, executor, rows)
     key, key_update = jax.random.split(after.key)
-    tuned, losses = jax.lax.scan(step, tuned, jax.random.split(key_update, fine.epochs))
+    tuned, losses = jax.lax.scan(epoch, tuned, jax.random.split(key_update, fine.epochs))
     metrics |= {
         "decoder_loss": jnp.mean(losses[0]),
         "decoder_kl": losses[1][-1, -1],
@@ -169,43 +167,21 @@ def iterate(
 
 
 def _rows(
-    config: PPOConfig,
-    fine: FineTuneConfig,
-    noisy: NoisyExecutor,
-    state: ppo.TrainState,
-    ticks: Rollout,
-    last_obs: Float[Array, "B S"],
+    config: PPOConfig, noisy: NoisyExecutor, running: Float[Array, "B D"], ticks: Rollout, judgement: Judgement
 ) -> Actions:
-    """Return every tick after `state` as a row, with the advantage of its action over what the critic expected."""
-    policy, model = ppo.make_policy(noisy, config), noisy.inner.model
-    done = ticks.terminated | ticks.truncated
-    _, reward = normalize.scale_rewards(state.reward_scale, ticks.reward, done, config.gamma)
-    values = [
-        policy.value(state.params, normalize.normalize(state.obs_statistics, obs))
-        for obs in (ticks.obs, ticks.final_obs, last_obs)
-    ]
-    advantage = semi_markov_advantages(
-        reward=reward if config.normalize_reward else ticks.reward,
-        ended=jnp.ones_like(done),
-        terminated=ticks.terminated,
-        truncated=ticks.truncated,
-        value=values[0],
-        final_value=values[1],
-        last_value=values[2],
-        gamma=config.gamma,
-        lambda_=config.lambda_,
-    )
-    option = fill_options(ticks.option, ticks.decision, state.running.option.option)
-    proprioception = model.state_scale(ticks.obs[..., : model.state_scale.mean.shape[-1]])
-    means = jax.vmap(jax.vmap(partial(mean_action, noisy.inner, model.params["decoder"])))(
-        option, proprioception, ticks.duration - 1
-    )
-    # The same numbers that the rollout drew.
-    noise = jax.random.normal(ppo.rollout_key(state), (*ticks.reward.shape, noisy.option_size + noisy.noise_size))
-    action = means + fine.std * noise[..., -means.shape[-1] :]
-    log_prob = jax.vmap(partial(_log_prob, std=fine.std))(action, means)
+    """Return every tick as a row, with the advantage of its action over what the critic expected.
+
+    `running` are the options at the first tick.
+    """
+    advantage = semi_markov_advantages(judgement, jnp.ones_like(ticks.ended), config.gamma, config.lambda_)
+    model, tick = noisy.inner.model, ticks.duration - 1
+    option = fill_options(ticks.option, ticks.decision, running)
+    proprioception = model.state_scale(ticks.obs[..., : model.state_size])
+    means = jax.vmap(jax.vmap(partial(mean_action, model, noisy.length)))(option, proprioception, tick)
+    action = means + noisy.std * ticks.noise[..., -means.shape[-1] :]
+    log_prob = jax.vmap(partial(_log_prob, std=noisy.std))(action, means)
     advantage = (advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-8)
-    rows = Actions(option, proprioception, ticks.duration - 1, action, log_prob, advantage)
+    rows = Actions(option, proprioception, tick, action, log_prob, advantage)
     return jax.tree.map(lambda x: x.reshape((-1, *x.shape[2:])), rows)
 
 
@@ -214,7 +190,6 @@ def _epoch(
     fine: FineTuneConfig,
     learning_rate: Scalar,
     executor: OptionExecutor,
-    learnt: Any,
     rows: Actions,
     tuned: Tuned,
     key: Key[Array, ""],
@@ -225,10 +200,7 @@ def _epoch(
     batches = jax.tree.map(lambda x: x[order].reshape((count, fine.minibatch_size, *x.shape[1:])), rows)
 
     def minibatch(tuned: Tuned, batch: Actions) -> tuple[Tuned, tuple[Array, Array]]:
-        gradient, terms = jax.grad(decoder_loss, has_aux=True)(tuned.decoder, learnt, executor, batch, config, fine)
-        with jax.numpy_dtype_promotion("standard"):  # Optax raises a float to an integer power
-            updates, optimizer = make_optimizer(config).update(gradient, tuned.optimizer)
-        decoder = jax.tree.map(lambda p, u: p - learning_rate * u, tuned.decoder, updates)
-        return Tuned(decoder, optimizer), terms
+        gradient, terms = jax.grad(decoder_loss, has_aux=True)(tuned.decoder, executor, batch, config, fine)
+        return Tuned(*descend(config, learning_rate, gradient, tuned.decoder, tuned.optimizer)), terms
 
     return jax.lax.scan(minibatch, tuned, batches)

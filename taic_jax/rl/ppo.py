@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import optax
 from flax import struct
-from jaxtyping import Array, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from taic_jax.config import PPOConfig
 from taic_jax.envs.base import Env, State
@@ -19,7 +19,7 @@ from taic_jax.networks import Policy, PolicyParams
 from taic_jax.nonfinite import first_nonfinite
 from taic_jax.options.execution import Executor
 from taic_jax.rl import normalize
-from taic_jax.rl.returns import semi_markov_advantages
+from taic_jax.rl.returns import Judgement, semi_markov_advantages
 from taic_jax.rl.rollout import DecideFn, Rollout, RolloutCarry, count_durations, rollout, start
 from taic_jax.rl.update import LOSSES, Decisions, Update, make_optimizer, update
 from taic_jax.types import Scalar, as_arrays
@@ -87,11 +87,6 @@ def as_agent(config: PPOConfig, executor: Executor, state: TrainState) -> Agent:
     return Agent(executor, state.params, state.obs_statistics, make_policy(executor, config))
 
 
-def rollout_key(state: TrainState) -> Key[Array, ""]:
-    """Return the key that the next iteration's rollout draws its noise from."""
-    return jax.random.split(state.key, 3)[1]
-
-
 def step_size(config: PPOConfig, learning_rate: Scalar, iteration: Int[Array, ""], num_iterations: int) -> Scalar:
     """Return the step size of an iteration, which decays to zero over all of them where the config says so."""
     progress = iteration.astype(jnp.float32) / num_iterations if config.learning_rate_decay else 0.0
@@ -105,51 +100,18 @@ def _standardize(x: Float[Array, " R"], mask: Array) -> Float[Array, " R"]:
 
 
 def iterate(
-    config: PPOConfig,
-    env: Env,
-    executor: Executor,
-    num_iterations: int,
-    state: TrainState,
-) -> tuple[TrainState, dict[str, Array], Rollout]:
-    """Run one iteration: T ticks of B environments, then all epochs of updates.
+    config: PPOConfig, env: Env, executor: Executor, num_iterations: int, state: TrainState
+) -> tuple[TrainState, dict[str, Array], Rollout, Judgement]:
+    """Run one iteration: collect T ticks of B environments, judge them, then update the policy in epochs.
 
-    Returns the next state, the iteration's metrics and the rollout (unscaled rewards).
+    Returns the next state, the iteration's metrics, the rollout (unscaled rewards) and its judgement.
     """
-    policy = make_policy(executor, config)
     key, key_rollout, key_update = jax.random.split(state.key, 3)
-    decide = as_agent(config, executor, state).decide()
-    running, ticks = rollout(
-        AutoReset(env), executor, decide, state.running, key_rollout, config.rollout_length, keep=_pack_metrics
-    )
-    reward_scale, reward = state.reward_scale, ticks.reward
-    if config.normalize_reward:
-        done = ticks.terminated | ticks.truncated
-        reward_scale, reward = normalize.scale_rewards(reward_scale, reward, done, config.gamma)
-
-    obs = normalize.normalize(state.obs_statistics, ticks.obs)
-    value = policy.value(state.params, obs)
-    final_obs = normalize.normalize(state.obs_statistics, ticks.final_obs)
-    last_obs = normalize.normalize(state.obs_statistics, running.env.obs)
-    advantage = semi_markov_advantages(
-        reward=reward,
-        ended=ticks.ended,
-        terminated=ticks.terminated,
-        truncated=ticks.truncated,
-        value=value,
-        final_value=policy.value(state.params, final_obs),
-        last_value=policy.value(state.params, last_obs),
-        gamma=config.gamma,
-        lambda_=config.lambda_,
-    )
-    decisions = Decisions(obs, ticks.option, ticks.log_prob, advantage, advantage + value)
-    decisions = jax.tree.map(lambda x: x.reshape((-1, *x.shape[2:])), decisions)
-    decision = ticks.decision.reshape(-1)
-    if config.normalize_advantage:
-        decisions = decisions.replace(advantage=_standardize(decisions.advantage, decision))
-
-    learning_rate = step_size(config, config.learning_rate, state.iteration, num_iterations)
-    result = update(policy, config, learning_rate, state.params, state.optimizer, decisions, decision, key_update)
-    state = state.replace(
+    running, ticks = collect(config, env, executor, state, key_rollout)
+    reward_scale, obs, judgement = judge(config, executor, state, ticks, running.env.obs)
+    rows = decisions_of(config, obs, ticks, judgement)
+    result = improve(config, executor, num_iterations, state, rows, ticks.decision.reshape(-1), key_update)
+    after = TrainState(
         params=_explore_anew(config, result.params, state.running.env.metrics, running.env.metrics),
         optimizer=result.optimizer,
         obs_statistics=normalize.update(state.obs_statistics, ticks.obs),
@@ -160,9 +122,59 @@ def iterate(
     )
     nonfinite = first_nonfinite(
         action=ticks.action, physics=running.env.physics, observation=(ticks.obs, ticks.final_obs),
-        reward=(ticks.reward, reward), value=advantage, loss=result.terms, gradient=(result.params, result.optimizer),
+        reward=(ticks.reward, judgement.reward), value=rows.advantage,
+        loss=result.terms, gradient=(result.params, result.optimizer),
     )  # fmt: skip
-    return state, _metrics(config, state, ticks, result, executor.length) | {"nonfinite": nonfinite}, ticks
+    return after, _metrics(config, after, ticks, result, executor.length) | {"nonfinite": nonfinite}, ticks, judgement
+
+
+def collect(
+    config: PPOConfig, env: Env, executor: Executor, state: TrainState, key: Key[Array, ""]
+) -> tuple[RolloutCarry, Rollout]:
+    """Roll the policy out for T ticks in B environments."""
+    decide = as_agent(config, executor, state).decide()
+    return rollout(AutoReset(env), executor, decide, state.running, key, config.rollout_length, keep=_pack_metrics)
+
+
+def judge(
+    config: PPOConfig, executor: Executor, state: TrainState, ticks: Rollout, last_obs: Float[Array, "B S"]
+) -> tuple[normalize.RewardScale, Float[Array, "T B S"], Judgement]:
+    """Return the next reward scale, the normalised observations, and rewards and values of the ticks."""
+    reward_scale, reward = state.reward_scale, ticks.reward
+    if config.normalize_reward:
+        done = ticks.terminated | ticks.truncated
+        reward_scale, reward = normalize.scale_rewards(reward_scale, reward, done, config.gamma)
+    obs, final_obs, last_obs = (
+        normalize.normalize(state.obs_statistics, x) for x in (ticks.obs, ticks.final_obs, last_obs)
+    )
+    value, final_value, last_value = (
+        make_policy(executor, config).value(state.params, x) for x in (obs, final_obs, last_obs)
+    )
+    return reward_scale, obs, Judgement(reward, ticks.terminated, ticks.truncated, value, final_value, last_value)
+
+
+def decisions_of(config: PPOConfig, obs: Float[Array, "T B S"], ticks: Rollout, judgement: Judgement) -> Decisions:
+    """Return a row per tick [T B] with its advantage and the critic's target; only decisions are meaningful."""
+    advantage = semi_markov_advantages(judgement, ticks.ended, config.gamma, config.lambda_)
+    rows = Decisions(obs, ticks.option, ticks.log_prob, advantage, advantage + judgement.value)
+    return jax.tree.map(lambda x: x.reshape((-1, *x.shape[2:])), rows)
+
+
+def improve(
+    config: PPOConfig,
+    executor: Executor,
+    num_iterations: int,
+    state: TrainState,
+    rows: Decisions,
+    decision: Bool[Array, " R"],
+    key: Key[Array, ""],
+) -> Update:
+    """Run all epochs of updates on the rows where the policy decided."""
+    if config.normalize_advantage:
+        rows = rows.replace(advantage=_standardize(rows.advantage, decision))
+    learning_rate = step_size(config, config.learning_rate, state.iteration, num_iterations)
+    policy = make_policy(executor, config)
+    return update(policy, config, learning_rate, state.params, state.optimizer, rows, decision, key)
 
 
 def _explore_anew(
@@ -170,7 +182,7 @@ def _explore_anew(
 ) -> PolicyParams:
     """Reset the standard deviation where half of the environments have changed after a rollout, and had not before it.
 
-    A task that tells no metric `changed` never changes.
+    A task without a metric `changed` never changes.
     """
     if not config.reset_at_change or "changed" not in after:
         return params
@@ -197,7 +209,7 @@ def _metrics(config: PPOConfig, state: TrainState, ticks: Rollout, result: Updat
 
 
 def _pack_metrics(state: State) -> Array:
-    """Keep the metrics of a tick as one array, in the order of their names: each array costs the loop time."""
+    """Return the metrics of a tick as one array, in the order of their names: each array costs the loop time."""
     return (
         jnp.stack([state.metrics[name] for name in sorted(state.metrics)], axis=-1) if state.metrics else state.reward
     )

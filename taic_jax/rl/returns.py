@@ -2,22 +2,34 @@
 
 import jax
 import jax.numpy as jnp
+from flax import struct
 from jaxtyping import Array, Bool, Float
 
 from taic_jax.types import Scalar
 
 
+class Judgement(struct.PyTreeNode):
+    """T ticks of B environments as the critic judges them.
+
+    Attributes:
+      reward: r_t, as the critic learns it.
+      terminated: the task ended after tick t: the bootstrap is zero.
+      truncated: the time limit cut the episode after tick t: bootstrap from `final_value`.
+      value: V(s_t).
+      final_value: V of the observation after tick t, before any reset.
+      last_value: V(s_T) [B], from which an option cut by the end of the rollout bootstraps.
+    """
+
+    reward: Array
+    terminated: Array
+    truncated: Array
+    value: Array
+    final_value: Array
+    last_value: Array
+
+
 def semi_markov_advantages(
-    *,
-    reward: Float[Array, "T B"],
-    ended: Bool[Array, "T B"],
-    terminated: Bool[Array, "T B"],
-    truncated: Bool[Array, "T B"],
-    value: Float[Array, "T B"],
-    final_value: Float[Array, "T B"],
-    last_value: Float[Array, " B"],
-    gamma: Scalar,
-    lambda_: Scalar,
+    judgement: Judgement, ended: Bool[Array, "T B"], gamma: Scalar, lambda_: Scalar
 ) -> Float[Array, "T B"]:
     """Return the advantage of deciding at each tick; only entries at decisions are meaningful.
 
@@ -29,19 +41,16 @@ def semi_markov_advantages(
     Z_t = r_t + gamma (bootstrap + lambda A_{t+1}). With every option one tick long this is GAE.
 
     Args:
-      reward: r_t.
+      judgement: rewards, values and ends of episodes.
       ended: the running option ended after tick t (an episode's end ends it too).
-      terminated: the task ended after tick t: the bootstrap is zero.
-      truncated: the time limit cut the episode after tick t: bootstrap from `final_value`.
-      value: V(s_t).
-      final_value: V of the observation after tick t, before any reset.
-      last_value: V(s_T), from which an option cut by the end of the rollout bootstraps.
       gamma: discount per tick.
       lambda_: decay per decision.
     """
+    value, last_value = judgement.value, judgement.last_value
     next_value = jnp.concatenate([value[1:], last_value[None]])
-    bootstrap = jnp.where(terminated, 0.0, jnp.where(truncated, final_value, next_value))
-    carries_on = ~(terminated | truncated)
+    after_cut = jnp.where(judgement.truncated, judgement.final_value, next_value)
+    bootstrap = jnp.where(judgement.terminated, 0.0, after_cut)
+    carries_on = ~(judgement.terminated | judgement.truncated)
     ended = ended.at[-1].set(True)
 
     def tick(carry: tuple[Array, Array], step: tuple[Array, ...]) -> tuple[tuple[Array, Array], Array]:
@@ -53,6 +62,6 @@ def semi_markov_advantages(
 
     with jax.numpy_rank_promotion("allow"):
         start = (last_value, jnp.zeros_like(last_value))
-        steps = (reward, ended, carries_on, bootstrap, value)
+        steps = (judgement.reward, ended, carries_on, bootstrap, value)
         _, advantages = jax.lax.scan(tick, start, steps, reverse=True)
     return advantages

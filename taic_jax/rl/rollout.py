@@ -36,7 +36,8 @@ class RolloutCarry(struct.PyTreeNode):
 class Rollout(struct.PyTreeNode):
     """T ticks of B environments; `option` and `log_prob` mean something only where `decision`.
 
-    `duration` counts the ticks that the running option has taken, this one included.
+    `duration` counts the ticks that the running option has taken, this one included; `noise` [T, B, Z] is all that was
+    drawn: D numbers of the policy, then those of the executor.
     """
 
     obs: Array
@@ -52,6 +53,7 @@ class Rollout(struct.PyTreeNode):
     final_obs: Array
     episode_return: Array
     extras: Any
+    noise: Any = None
 
 
 def start(env: Env, executor: Executor, num_envs: int, key: Key[Array, ""]) -> RolloutCarry:
@@ -125,4 +127,5 @@ def rollout(
     num_envs = running.ended.shape[0]
     noise = jax.random.normal(key, (length, num_envs, executor.option_size + executor.noise_size))
     scan = partial(jax.lax.scan, partial(_tick, env, executor, decide, keep))
-    return over_envs(scan, num_envs)(running, noise)
+    running, ticks = over_envs(scan, num_envs)(running, noise)
+    return running, ticks.replace(noise=noise)

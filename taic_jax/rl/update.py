@@ -1,16 +1,19 @@
 """PPO's updates: clipped losses of minibatches of decisions, in epochs; no update is spent on other ticks."""
 
+from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import optax
 from flax import struct
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
 from taic_jax.config import PPOConfig
 from taic_jax.networks import Policy, PolicyParams
-from taic_jax.types import Scalar
+from taic_jax.types import Scalar, Tree
 
 LOSSES = ("policy_loss", "value_loss", "entropy", "approx_kl", "clip_fraction")
 
@@ -26,9 +29,18 @@ class Decisions(struct.PyTreeNode):
 
 
 def make_optimizer(config: PPOConfig) -> optax.GradientTransformation:
-    """Return Adam behind global-norm clipping on one flat vector; the learning rate is applied by `_update`."""
+    """Return Adam behind global-norm clipping on one flat vector; `descend` applies the step size."""
     clip = optax.clip_by_global_norm(config.max_grad_norm)
     return optax.flatten(optax.chain(clip, optax.scale_by_adam(eps=1e-5)))
+
+
+def descend(
+    config: PPOConfig, learning_rate: Scalar, gradient: Any, params: Tree, optimizer: optax.OptState
+) -> tuple[Tree, optax.OptState]:
+    """Take one step of the optimiser; return the next parameters and its next state."""
+    with jax.numpy_dtype_promotion("standard"):  # Optax raises a float to an integer power
+        updates, optimizer = make_optimizer(config).update(gradient, optimizer)
+    return jax.tree.map(lambda p, u: p - learning_rate * u, params, updates), optimizer
 
 
 def ppo_loss(
@@ -77,9 +89,7 @@ def _minibatch(
     batch = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, first, config.minibatch_size), rows)
     weight = jnp.where(jnp.arange(config.minibatch_size) < size, 1.0 / size.astype(jnp.float32), 0.0)
     gradient, terms = jax.grad(ppo_loss, has_aux=True)(carry.params, policy, batch, weight, config)
-    with jax.numpy_dtype_promotion("standard"):  # Optax raises a float to an integer power
-        updates, optimizer = make_optimizer(config).update(gradient, carry.optimizer)
-    params = jax.tree.map(lambda p, u: p - learning_rate * u, carry.params, updates)
+    params, optimizer = descend(config, learning_rate, gradient, carry.params, carry.optimizer)
     return Update(params, optimizer, carry.terms + terms)
 
 
@@ -101,6 +111,7 @@ def _epoch(
     config: PPOConfig,
     learning_rate: Scalar,
     packed: Float[Array, "R F"],
+    unpack: Callable[[Array], Decisions],
     decision: Array,
     carry: Update,
     key: Key[Array, ""],
@@ -109,10 +120,8 @@ def _epoch(
     count = jnp.sum(decision, dtype=jnp.int32)
     num_minibatches = (count + config.minibatch_size - 1) // config.minibatch_size
     # The ticks between decisions are never touched.
-    rows = jnp.pad(packed[shuffled(decision, key)], ((0, config.minibatch_size), (0, 0)))
-    size = policy.option_size
-    split = Decisions(rows[:, size + 3 :], rows[:, :size], *jnp.moveaxis(rows[:, size : size + 3], 1, 0))
-    step = partial(_minibatch, policy, config, learning_rate, split, count, num_minibatches)
+    rows = unpack(jnp.pad(packed[shuffled(decision, key)], ((0, config.minibatch_size), (0, 0))))
+    step = partial(_minibatch, policy, config, learning_rate, rows, count, num_minibatches)
     return jax.lax.fori_loop(0, num_minibatches, step, carry), None
 
 
@@ -127,10 +136,10 @@ def update(
     key: Key[Array, ""],
 ) -> Update:
     """Run all epochs over the decisions among R ticks."""
-    scalars = jnp.stack([decisions.log_prob, decisions.advantage, decisions.target], axis=1)
     # One matrix, so that a permutation is a single gather.
-    packed = jnp.concatenate([decisions.option, scalars, decisions.obs], axis=1)
+    packed = jax.vmap(lambda row: ravel_pytree(row)[0])(decisions)
+    unpack = jax.vmap(ravel_pytree(jax.tree.map(lambda x: x[0], decisions))[1])
     carry = Update(params, optimizer, jnp.zeros(len(LOSSES)))
-    epoch = partial(_epoch, policy, config, learning_rate, packed, decision)
+    epoch = partial(_epoch, policy, config, learning_rate, packed, unpack, decision)
     carry, _ = jax.lax.scan(epoch, carry, jax.random.split(key, config.epochs))
     return carry

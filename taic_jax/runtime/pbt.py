@@ -45,14 +45,14 @@ class Population:
         return Members(state, config, jax.vmap(lambda k: jax.random.fold_in(k, 1))(key), jnp.zeros(len(key), jnp.int32))
 
     def evolving(self, step: Callable[..., tuple[Any, dict, Any]]) -> Callable[..., tuple[Members, dict, Any]]:
-        """Return a step (members, configs, ...) from one (states, configs, ...) whose metrics hold `return`.
+        """Return a step (members, trainer) from one (states, trainer) whose metrics hold `return`.
 
-        The members' own configs take the place of those given. Metrics tell the numbers that the step was taken with
-        (`pbt/NAME`), and of which row each goes on after it (`pbt/parent`).
+        The members' own configs take the place of the trainer's. Metrics hold the numbers that the step was taken with
+        (`pbt/NAME`), and the row that each goes on from after it (`pbt/parent`).
         """
 
-        def call(members: Members, _: Config, *args: Any) -> tuple[Members, dict, Any]:
-            state, metrics, extra = step(members.state, members.config, *args)
+        def call(members: Members, trainer: Any) -> tuple[Members, dict, Any]:
+            state, metrics, extra = step(members.state, trainer.replace(config=members.config))
             count = members.count + 1
             key, key_donor, key_factor = _split(members.key)
             score = jnp.where(metrics["nonfinite"] == FINITE, metrics["return"], jnp.nan)

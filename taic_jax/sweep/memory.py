@@ -11,8 +11,8 @@ import psutil
 from taic_jax.artifacts.experience import experience_bytes, num_blocks
 from taic_jax.config import Config, ConfigError, kept_ticks, needs_collect
 from taic_jax.options.dataset import Experience, make_dataset
-from taic_jax.pipeline import over_rows
 from taic_jax.tasks import make_envs
+from taic_jax.trainer import init_rows, make_trainer, step_rows
 from taic_jax.types import as_rows
 
 MIB = 2**20
@@ -60,8 +60,8 @@ def machine_memory() -> int:
 
 
 def _step_bytes(rows: Config, env: Any, stage: str, keys: jax.Array) -> int:
-    init, step = over_rows(env, stage, "init"), over_rows(env, stage, "step")
-    return _program_bytes(step, rows, jax.eval_shape(init, rows, keys))
+    trainer = make_trainer(stage, rows, env)
+    return _program_bytes(step_rows, jax.eval_shape(init_rows, trainer, keys), trainer)
 
 
 def _experience(config: Config, env: Any) -> list[Experience]:

@@ -26,6 +26,7 @@ CONFIG = OptionsConfig(length=3, size=2, hidden_size=4, mlp_sizes=(4,), decoder_
 HIDDEN = (4, 3)
 PPO = PPOConfig(hidden_sizes=HIDDEN)
 P, A = 2, 1
+NETWORKS = make_networks(CONFIG, P, A)
 
 
 class Body(Counting):
@@ -42,10 +43,11 @@ class Body(Counting):
 
 def make_model(seed: Any) -> OptionModel:
     return OptionModel(
-        init_params(make_networks(CONFIG, P, A), CONFIG, jax.random.key(seed)),
+        init_params(NETWORKS, CONFIG, jax.random.key(seed)),
         Scale(jnp.full(P, seed, jnp.float32), jnp.ones(P)),
         Scale(jnp.zeros(P), jnp.ones(P)),
         jnp.asarray(seed, jnp.float32),
+        NETWORKS,
     )
 
 

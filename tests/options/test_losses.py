@@ -85,7 +85,7 @@ def problem() -> tuple[dict, OptionModel, Window, jax.Array]:
 @jax.jit
 def gradients_of(config: OptionsConfig, params: dict, model: OptionModel, windows: Window, noise: jax.Array):
     """Return the gradient of the loss that is descended, the losses, and the gradient of the true L_adv."""
-    descended, terms = jax.grad(total_loss, has_aux=True)(params, NETWORKS, model, config, windows, noise)
+    descended, terms = jax.grad(total_loss, has_aux=True)(params, model, config, windows, noise)
     return descended, terms, jax.grad(adversarial_alone)(params, model, windows, noise)
 
 
@@ -125,7 +125,7 @@ def test_only_the_encoder_climbs_the_adversarial_loss(problem):
 
 def test_total_is_the_weighted_sum(problem):
     params, model, windows, noise = problem
-    total, terms = jax.jit(total_loss, static_argnums=1)(params, NETWORKS, model, with_lambda_adv(0.3), windows, noise)
+    total, terms = jax.jit(total_loss)(params, model, with_lambda_adv(0.3), windows, noise)
     # What is minimised over F and, behind the reversal, E: the forward value of L_adv enters with weight one.
     expected = terms["reconstruction_loss"] + 0.5 * terms["kl_loss"] + 2.0 * terms["prediction_loss"]
     np.testing.assert_allclose(total, expected + terms["adversarial_loss"], rtol=1e-6)

@@ -37,8 +37,8 @@ def with_unit_scales(model: OptionModel) -> OptionModel:
 
 @pytest.mark.parametrize("config", [CONFIG, CLOSED], ids=["open", "closed"])
 def test_decoder_steps_are_the_unrolled_call(config):
-    networks, model = random_model(config, STATE_SIZE, ACTION_SIZE)
-    decoder, params, option = networks.decoder, model.params["decoder"], jnp.array([0.5, -1.0])
+    model = random_model(config, STATE_SIZE, ACTION_SIZE)
+    decoder, params, option = model.networks.decoder, model.params["decoder"], jnp.array([0.5, -1.0])
     states = draw(np.random.default_rng(3), 5, STATE_SIZE)
     unrolled = jax.jit(decoder.apply)
     actions, logits = unrolled(params, option, states)
@@ -58,18 +58,18 @@ def test_decoder_steps_are_the_unrolled_call(config):
 
 def test_a_closed_loop_can_tell_time():
     """In one and the same state its action and its end signal still change from tick to tick."""
-    networks, model = random_model(CLOSED, STATE_SIZE, ACTION_SIZE)
-    outputs = networks.decoder.apply(model.params["decoder"], jnp.array([0.5, -1.0]), jnp.ones((3, STATE_SIZE)))
+    model = random_model(CLOSED, STATE_SIZE, ACTION_SIZE)
+    outputs = model.decode(jnp.array([0.5, -1.0]), jnp.ones((3, STATE_SIZE)))
     for output in outputs:
         assert np.abs(np.diff(output, axis=0)).min() > 1e-3
 
 
 def test_the_executor_shows_a_closed_loop_the_normalised_state():
-    networks, model = random_model(CLOSED, STATE_SIZE, ACTION_SIZE)
-    executor, option = make_executor(CLOSED, ACTION_SIZE, model), jnp.array([0.5, -1.0])
+    model = random_model(CLOSED, STATE_SIZE, ACTION_SIZE)
+    executor, option = make_executor(CLOSED, model), jnp.array([0.5, -1.0])
     obs = draw(np.random.default_rng(4), CLOSED.length, 7)
     states = (obs[:, :STATE_SIZE] - model.state_scale.mean[None]) / model.state_scale.std[None]
-    decoded, _ = networks.decoder.apply(model.params["decoder"], option, states)
+    decoded, _ = model.decode(option, states)
     act, carry = jax.jit(executor.act), executor.start(option, obs[0])
     for i in range(CLOSED.length):
         carry, action = act(carry, obs[i], jnp.zeros(0))
@@ -79,7 +79,7 @@ def test_the_executor_shows_a_closed_loop_the_normalised_state():
 
 def test_encoder_gives_every_prefix_at_once(model):
     actions = jnp.asarray(np.random.default_rng(1).normal(size=(4, ACTION_SIZE)), jnp.float32)
-    encode = jax.jit(lambda actions: NETWORKS.encoder.apply(model.params["encoder"], actions))
+    encode = jax.jit(model.encode)
     means, log_stds = encode(actions)
     assert means.shape == log_stds.shape == (4, CONFIG.size)
     for i in range(4):
@@ -89,9 +89,9 @@ def test_encoder_gives_every_prefix_at_once(model):
 
 
 def test_executor_emits_the_decoders_actions_and_never_ends_early(model):
-    executor, option = make_executor(CONFIG, ACTION_SIZE, model), jnp.array([3.0, -2.0])
+    executor, option = make_executor(CONFIG, model), jnp.array([3.0, -2.0])
     assert isinstance(executor, OptionExecutor) and executor.option_size == CONFIG.size
-    decoded, _ = NETWORKS.decoder.apply(model.params["decoder"], option, jnp.zeros((CONFIG.length, STATE_SIZE)))
+    decoded, _ = model.decode(option, jnp.zeros((CONFIG.length, STATE_SIZE)))
     act, carry = jax.jit(executor.act), executor.start(option, jnp.zeros(7))
     for i in range(CONFIG.length):
         # An observation may have more entries than the slice the model knows.

@@ -54,12 +54,12 @@ def test_stop_index_by_hand(errors, delta, index):
 def test_prefix_errors_by_hand():
     """P whose weights are zero predicts its bias, here 0.5: the error is that of the normalised change from s_0."""
     config = dataclasses.replace(CONFIG, mlp_sizes=(1,))
-    networks, model = random_model(config, state_size=1, action_size=1)
+    model = random_model(config, state_size=1, action_size=1)
     params = jax.tree.map(jnp.zeros_like, model.params)
     params["predictor"]["params"]["MLP_0"]["Dense_1"]["bias"] = jnp.array([0.5])
     change = Scale(jnp.array([1.0]), jnp.array([2.0]))
     errors = prefix_errors(
-        networks, model.replace(params=params, change_scale=change), jnp.zeros((2, 2)), jnp.array([[3.0], [5.0], [8.0]])
+        model.replace(params=params, change_scale=change), jnp.zeros((2, 2)), jnp.array([[3.0], [5.0], [8.0]])
     )
     # Changes 2 and 5, normalised 0.5 and 2.
     np.testing.assert_allclose(errors, [0.0, 2.25])
@@ -84,9 +84,9 @@ def drive(executor: OptionExecutor, option: jax.Array, obs: jax.Array, noise: ja
 @pytest.fixture(scope="module")
 def driven() -> tuple[OptionExecutor, jax.Array, jax.Array]:
     """Return an executor under termination predict, an option some of whose actions are clipped, and observations."""
-    _, model = random_model(CONFIG, STATE_SIZE, ACTION_SIZE)
+    model = random_model(CONFIG, STATE_SIZE, ACTION_SIZE)
     obs = draw(np.random.default_rng(4), LENGTH + 1, OBS_SIZE)
-    return make_executor(CONFIG, ACTION_SIZE, model), jnp.array([-1.0, 1.0]), obs
+    return make_executor(CONFIG, model), jnp.array([-1.0, 1.0]), obs
 
 
 def test_following_tick_by_tick_is_the_batched_pass(driven):
@@ -94,9 +94,9 @@ def test_following_tick_by_tick_is_the_batched_pass(driven):
     assert isinstance(executor.termination, Predict) and executor.noise_size == 0
     actions, carries, _ = drive(executor, option, obs)
     assert np.any(np.abs(actions) == 1.0) and np.any(np.abs(actions) < 1.0)
-    networks, model = executor.networks, executor.model
-    means, _ = networks.encoder.apply(model.params["encoder"], actions)
-    errors = prefix_errors(networks, model, means, obs[:, :STATE_SIZE])
+    model = executor.model
+    means, _ = model.encode(actions)
+    errors = prefix_errors(model, means, obs[:, :STATE_SIZE])
     for i in range(LENGTH):
         np.testing.assert_allclose(carries[i].memory.option, means[i], rtol=1e-5, atol=1e-6)
     for delta in [*(errors * 0.999), *(errors * 1.001), jnp.float32(1e-9), jnp.float32(jnp.inf)]:
@@ -120,10 +120,10 @@ def take_noise(obs: jax.Array, noise: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 def test_in_a_rollout_every_option_ends_where_algorithm_1_stops():
     """Also an environment's second option: nothing of the one before is remembered."""
-    networks, model = random_model(CONFIG, state_size=1, action_size=1)
+    model = random_model(CONFIG, state_size=1, action_size=1)
     scales = Scale(jnp.full(1, 5.0), jnp.full(1, 5.0)), Scale(jnp.full(1, -2.0), jnp.ones(1))
-    model = OptionModel(model.params, *scales, jnp.float32(DELTA))
-    env, executor = AutoReset(Counting(7, spread=5)), make_executor(CONFIG, 1, model)
+    model = OptionModel(model.params, *scales, jnp.float32(DELTA), model.networks)
+    env, executor = AutoReset(Counting(7, spread=5)), make_executor(CONFIG, model)
     running = start(env, executor, 4, jax.random.key(0))
     ticks = jax.jit(lambda running: rollout(env, executor, take_noise, running, jax.random.key(1), 24)[1])(running)
     seen = set()
@@ -132,8 +132,8 @@ def test_in_a_rollout_every_option_ends_where_algorithm_1_stops():
         for first, last in zip([0, *(lasts[:-1] + 1)], lasts, strict=True):
             states = jnp.concatenate([ticks.obs[first : last + 1, b], ticks.final_obs[last, b][None]])
             actions = jnp.pad(ticks.action[first : last + 1, b], ((0, LENGTH - (last + 1 - first)), (0, 0)))
-            means = encode(networks.encoder, model.params["encoder"], actions)[: last + 1 - first]
-            surprised = np.asarray(prefix_errors(networks, model, means, states) >= DELTA)
+            means = encode(model.networks.encoder, model.params["encoder"], actions)[: last + 1 - first]
+            surprised = np.asarray(prefix_errors(model, means, states) >= DELTA)
             assert not surprised[:-1].any()
             assert surprised[-1] or len(surprised) == LENGTH or ticks.terminated[last, b]
             seen.add((len(surprised), bool(surprised[-1])))
@@ -164,9 +164,9 @@ def test_masked_ticks_have_no_end_loss():
 def make_output(end_signal: Any) -> tuple[OptionExecutor, jax.Array]:
     """Return an executor under termination output, and the end logits [L] of one option."""
     config = dataclasses.replace(CONFIG, termination="output", end_signal=end_signal)
-    networks, model = random_model(config, STATE_SIZE, ACTION_SIZE)
-    _, logits = networks.decoder.apply(model.params["decoder"], jnp.array([0.5, -1.0]), jnp.zeros((LENGTH, STATE_SIZE)))
-    return make_executor(config, ACTION_SIZE, model), logits
+    model = random_model(config, STATE_SIZE, ACTION_SIZE)
+    _, logits = model.decode(jnp.array([0.5, -1.0]), jnp.zeros((LENGTH, STATE_SIZE)))
+    return make_executor(config, model), logits
 
 
 def test_a_thresholded_signal_ends_where_it_is_above_one_half():
@@ -200,7 +200,7 @@ def test_a_sampled_signal_ends_as_often_as_its_probability():
 
 def test_a_fixed_option_takes_no_noise():
     executor = make_executor(
-        dataclasses.replace(CONFIG, termination="fixed"), ACTION_SIZE, random_model(CONFIG, STATE_SIZE, ACTION_SIZE)[1]
+        dataclasses.replace(CONFIG, termination="fixed"), random_model(CONFIG, STATE_SIZE, ACTION_SIZE)
     )
     assert executor.termination == Fixed() and executor.noise_size == 0
 
@@ -208,6 +208,6 @@ def test_a_fixed_option_takes_no_noise():
 @pytest.mark.parametrize(("unit", "delta"), [("quantile", 1.0), ("error", 0.7)])
 def test_delta_is_the_models_as_a_quantile_and_the_configs_as_an_error(unit, delta):
     config = dataclasses.replace(CONFIG, delta_unit=unit, delta=0.7)
-    _, model = random_model(config, STATE_SIZE, ACTION_SIZE)
-    executor = make_executor(config, ACTION_SIZE, model.replace(delta=jnp.ones(())))
+    model = random_model(config, STATE_SIZE, ACTION_SIZE)
+    executor = make_executor(config, model.replace(delta=jnp.ones(())))
     np.testing.assert_allclose(executor.model.delta, delta)

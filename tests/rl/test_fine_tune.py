@@ -12,12 +12,11 @@ from tiny_runs import CONFIG, KilledError, assert_same_arrays, die, last_state, 
 
 from taic_jax.artifacts.models import load_options
 from taic_jax.config import FineTuneConfig, OptionsConfig, PPOConfig
-from taic_jax.envs import AutoReset, make_env
+from taic_jax.envs import make_env
 from taic_jax.options.execution import OptionExecutor, make_executor
 from taic_jax.options.model import OptionModel, Scale, init_params, make_networks
 from taic_jax.pipeline import run_pipeline
 from taic_jax.rl import fine_tune, ppo
-from taic_jax.rl.rollout import rollout
 from taic_jax.runtime.checkpoint import Checkpoints
 from taic_jax.types import as_arrays
 
@@ -43,9 +42,10 @@ class Forward(Probe):
 def make(decoder: str) -> OptionExecutor:
     """Return the executor of a model as it is before it learns."""
     options = dataclasses.replace(OPTIONS, decoder=decoder)
-    params = init_params(make_networks(options, 1, 1), options, jax.random.key(3))
+    networks = make_networks(options, 1, 1)
+    params = init_params(networks, options, jax.random.key(3))
     scale = Scale(jnp.zeros(1), jnp.ones(1))
-    return make_executor(options, 1, OptionModel(params, scale, scale, jnp.ones(())))
+    return make_executor(options, OptionModel(params, scale, scale, jnp.ones(()), networks))
 
 
 @partial(jax.jit, static_argnames="count")
@@ -84,14 +84,13 @@ def test_changes_d_and_nothing_else(decoder):
 
 @pytest.mark.parametrize("decoder", ["open", "closed"])
 def test_likelihoods_are_of_the_actions_that_were_taken(decoder):
-    """What `_rows` makes of the rollout and its key is what the executor emitted."""
+    """The rows hold the actions that the executor emitted, before they were clipped."""
     executor = make(decoder)
     # After an iteration, whose last options go on in the next.
     state = tune(dataclasses.replace(FINE, learning_rate=jnp.zeros(())), executor, 1)[1][0]
     noisy = fine_tune.NoisyExecutor(executor, FINE.std)
-    decide = ppo.as_agent(PPO, executor, state).decide()
-    running, ticks = rollout(AutoReset(Forward()), noisy, decide, state.running, ppo.rollout_key(state), T)
-    rows = fine_tune._rows(PPO, FINE, noisy, state, ticks, running.env.obs)
+    _, _, ticks, judgement = ppo.iterate(PPO, Forward(), noisy, ITERATIONS, state)
+    rows = fine_tune._rows(PPO, noisy, state.running.option.option, ticks, judgement)
     np.testing.assert_allclose(np.clip(rows.action, -1, 1), ticks.action.reshape(-1, 1), atol=1e-5)
     assert rows.duration.min() == 0 and rows.duration.max() == L - 1
     # One standard deviation away the likelihood is exp(-1/2) of the highest.
@@ -102,8 +101,12 @@ def test_likelihoods_are_of_the_actions_that_were_taken(decoder):
 def test_follows_the_reward(decoder):
     executor = make(decoder)
     (_, tuned), (_, tuned_after), metrics = tune(FINE, executor, 10)
+
+    def action(model: OptionModel, option: jax.Array) -> jax.Array:
+        return fine_tune.mean_action(model, L, option, jnp.zeros(1), jnp.zeros((), int))
+
     before, after = (
-        np.mean(jax.vmap(lambda o, d=d: fine_tune.mean_action(executor, d, o, jnp.zeros(1), jnp.zeros((), int)))(
+        np.mean(jax.vmap(partial(action, executor.model.with_decoder(d)))(
             jax.random.normal(jax.random.key(1), (64, 2))
         ))
         for d in (tuned.decoder, tuned_after.decoder)

@@ -63,9 +63,8 @@ def learnt():
 def test_the_end_signal_says_how_long_the_window_was(learnt):
     """All actions are the same, so the code can tell a window's length by counting alone."""
     model, losses = learnt
-    executor = make_executor(OUTPUT, 1, model)
-    encoder = executor.networks.encoder
-    means, _ = encoder.apply(model.params["encoder"], jnp.full((LENGTH, 1), 0.5))
+    executor = make_executor(OUTPUT, model)
+    means, _ = model.encode(jnp.full((LENGTH, 1), 0.5))
     act = jax.jit(executor.act)
     for ticks in range(SHORTEST, LENGTH + 1):
         carry, ends = executor.start(means[ticks - 1], jnp.zeros(2)), []
@@ -89,17 +88,17 @@ def test_windows_take_between_shortest_and_length_ticks(learnt):
 
 @jax.jit
 def measure(config: OptionsConfig, dataset: Dataset, state: learning.LearnState, key: jax.Array) -> jax.Array:
-    return learning._measure_delta(config, make_networks(config, 2, 1), dataset, state, key)
+    return learning._measure_delta(config, dataset, state, key)
 
 
 @jax.jit
 def errors_of(config: OptionsConfig, dataset: Dataset, state: learning.LearnState) -> jax.Array:
     """Return P's error on every prefix of every window, in the order of `dataset.starts`."""
-    networks, model = make_networks(config, 2, 1), learning.as_model(state, dataset)
+    model = learning.as_model(state, dataset)
     which = jnp.arange(len(dataset.starts))
     windows = gather(dataset, which, jnp.full(len(which), config.length), config.length)
-    means, _ = jax.vmap(partial(networks.encoder.apply, state.params["encoder"]))(windows.actions)
-    return jax.vmap(partial(prefix_errors, networks, model))(means, windows.states)
+    means, _ = jax.vmap(model.encode)(windows.actions)
+    return jax.vmap(partial(prefix_errors, model))(means, windows.states)
 
 
 def wild_where_held_out() -> Experience:

@@ -17,7 +17,7 @@ from taic_jax.envs import Navigation, TimeLimit
 from taic_jax.networks import Policy, PolicyParams
 from taic_jax.options.execution import IdentityExecutor
 from taic_jax.rl import normalize, ppo, update
-from taic_jax.rl.returns import semi_markov_advantages
+from taic_jax.rl.returns import Judgement, semi_markov_advantages
 from taic_jax.rl.rollout import Rollout
 from taic_jax.types import as_arrays
 
@@ -81,7 +81,7 @@ def test_options_are_drawn_from_the_policy():
 @pytest.fixture(scope="module")
 def iterate():
     """One iteration that is one gradient step on all decisions, compiled once."""
-    return jax.jit(partial(ppo.iterate, as_arrays(ONE_STEP), ENV, EXECUTOR, ITERATIONS))
+    return jax.jit(lambda state: ppo.iterate(as_arrays(ONE_STEP), ENV, EXECUTOR, ITERATIONS, state)[:3])
 
 
 @pytest.fixture(scope="module")
@@ -99,10 +99,8 @@ def plain_update(
         normalize.normalize(state.obs_statistics, x) for x in (ticks.obs, ticks.final_obs, last_obs)
     )
     value, final_value, last_value = (policy.value(state.params, x) for x in (obs, final_obs, last_obs))
-    advantage = semi_markov_advantages(
-        reward=ticks.reward, ended=ticks.ended, terminated=ticks.terminated, truncated=ticks.truncated,
-        value=value, final_value=final_value, last_value=last_value, gamma=config.gamma, lambda_=config.lambda_,
-    )  # fmt: skip
+    judgement = Judgement(ticks.reward, ticks.terminated, ticks.truncated, value, final_value, last_value)
+    advantage = semi_markov_advantages(judgement, ticks.ended, config.gamma, config.lambda_)
     target, advantage = (advantage + value)[rows], advantage[rows]
     advantage = (advantage - advantage.mean()) / advantage.std()
     decisions = update.Decisions(obs[rows], ticks.option[rows], ticks.log_prob[rows], advantage, target)
@@ -156,7 +154,7 @@ def test_durations_are_counted_where_options_take_more_than_a_tick(iterate, firs
     assert metrics["durations"].shape == (3,) and metrics["durations"].min() > 0
     flat, config = IdentityExecutor(1), as_arrays(ONE_STEP)
     state = jax.eval_shape(partial(ppo.init, config, ENV, flat), jax.random.key(3))
-    _, of_flat, _ = jax.eval_shape(partial(ppo.iterate, config, ENV, flat, ITERATIONS), state)
+    _, of_flat, *_ = jax.eval_shape(partial(ppo.iterate, config, ENV, flat, ITERATIONS), state)
     assert set(of_flat) == set(metrics) - {"durations"}
 
 
@@ -179,7 +177,7 @@ def test_every_decision_is_used_once_an_epoch_and_nothing_else(monkeypatch, firs
 
     monkeypatch.setattr(update, "ppo_loss", spy)
     config = as_arrays(dataclasses.replace(ONE_STEP, epochs=2, minibatch_size=5))
-    _, _, ticks = jax.jit(partial(ppo.iterate, config, ENV, EXECUTOR, ITERATIONS))(first_state)
+    _, _, ticks, _ = jax.jit(partial(ppo.iterate, config, ENV, EXECUTOR, ITERATIONS))(first_state)
     jax.effects_barrier()
     decisions = pairs(ticks.option[ticks.decision][:, 0], ticks.log_prob[ticks.decision])
     assert len(minibatches) == 2 * math.ceil(len(decisions) / 5)
@@ -244,7 +242,7 @@ def test_exploration_is_reset_once_where_the_task_changes(reset):
     state, narrow, found = ppo.init(config, env, executor, jax.random.key(0)), jnp.full(2, -1.0), []
     iterate = jax.jit(partial(ppo.iterate, config, env, executor, ITERATIONS))
     for _ in range(2):
-        state, metrics, _ = iterate(state.replace(params=state.params.replace(log_std=narrow)))
+        state, metrics, *_ = iterate(state.replace(params=state.params.replace(log_std=narrow)))
         found.append(state.params.log_std.tolist())
     assert found == [[0.5, 0.5] if reset else [-1.0, -1.0], [-1.0, -1.0]]
     assert metrics["episodes"] == 2.0, "of 16 ticks, two environments end their second episodes in the second rollout"

@@ -5,9 +5,13 @@ import numpy as np
 import pytest
 import rlax
 
-from taic_jax.rl.returns import semi_markov_advantages
+from taic_jax.rl.returns import Judgement, semi_markov_advantages
 
-advantages_of = jax.jit(semi_markov_advantages)
+
+@jax.jit
+def advantages_of(*, ended, gamma, lambda_, **judgement):
+    """Return the advantages of ticks by name."""
+    return semi_markov_advantages(Judgement(**judgement), ended, gamma, lambda_)
 
 
 def make_ticks(seed: int, T: int = 12, B: int = 3, ends: float = 0.4, episode_ends: float = 0.15) -> dict:
