@@ -24,7 +24,7 @@ from taic_jax.experiments.cells import PATHS, SPACES, Cell, all_cells
 from taic_jax.experiments.option_paths import paths_of
 from taic_jax.experiments.spaces import example_space, measure_spaces
 from taic_jax.experiments.table import TABLE, TableError, append_row, config_hash, difference, read_table, row_of
-from taic_jax.pipeline import collect, run_pipeline, take_over, train_baseline
+from taic_jax.pipeline import collect, make_envs, run_pipeline, take_over, train_baseline
 from taic_jax.runtime.checkpoint import ArtifactError
 from taic_jax.runtime.devices import Devices, make_devices, open_devices
 from taic_jax.runtime.driver import CLOCK, Clock, Run
@@ -33,7 +33,6 @@ from taic_jax.runtime.logging import RunLogger
 from taic_jax.runtime.program_cache import keep_programs
 from taic_jax.runtime.run_folder import RunFolderError, claimed, prepare_folder
 from taic_jax.summary import as_summary
-from taic_jax.tasks import make_envs
 from taic_jax.types import as_rows
 
 

@@ -19,12 +19,11 @@ import tyro
 from taic_jax.analysis.statistics import bootstrap_interval, iqm
 from taic_jax.command_line import tell
 from taic_jax.config import CollectConfig, Config, EnvConfig, EvaluateConfig, PPOConfig, TrainConfig
-from taic_jax.pipeline import train_baseline
+from taic_jax.pipeline import make_envs, train_baseline
 from taic_jax.runtime.driver import CLOCK, Clock, Run
 from taic_jax.runtime.logging import RunLogger
 from taic_jax.runtime.run_folder import prepare_folder
 from taic_jax.summary import commit
-from taic_jax.tasks import make_envs
 from taic_jax.types import as_rows
 
 # Mean return at one million interactions: CleanRL's benchmark (version 4; the ant's is the PPO of the TD3 paper,

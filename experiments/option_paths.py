@@ -19,7 +19,7 @@ from taic_jax.config_io import load_config
 from taic_jax.envs.navigation import MAX_SPEED, Navigation
 from taic_jax.options.dataset import gather, make_dataset
 from taic_jax.options.model import OptionModel
-from taic_jax.tasks import make_envs
+from taic_jax.pipeline import make_envs
 from taic_jax.types import as_arrays
 
 STEPS = 11

@@ -31,10 +31,10 @@ from taic_jax.options.dataset import Experience
 from taic_jax.options.execution import make_executor
 from taic_jax.options.learning import learn
 from taic_jax.options.model import OptionModel
+from taic_jax.pipeline import make_envs
 from taic_jax.rl import ppo
 from taic_jax.summary import commit
 from taic_jax.sweep.axes import configs_of, grid, is_leaf, parse_axis, replace
-from taic_jax.tasks import make_envs
 from taic_jax.types import as_arrays
 from taic_jax.validation import validate
 

@@ -13,7 +13,7 @@ from taic_jax.artifacts.models import load_options
 from taic_jax.config import COLLECT
 from taic_jax.config_io import load_config
 from taic_jax.options.execution import make_executor
-from taic_jax.tasks import make_envs
+from taic_jax.pipeline import make_envs
 from taic_jax.types import as_arrays
 
 MEASURES = (

@@ -30,9 +30,9 @@ from taic_jax.envs.wrappers import AutoReset, Wrapper
 from taic_jax.experiments.drawing import RESULTS
 from taic_jax.experiments.figure7 import with_interval, write_numbers
 from taic_jax.options.execution import Executor, make_executor
+from taic_jax.pipeline import make_envs
 from taic_jax.rl.rollout import RolloutCarry, rollout, start
 from taic_jax.runtime.checkpoint import ArtifactError
-from taic_jax.tasks import make_envs
 from taic_jax.types import as_arrays
 
 CODES, STARTS = 64, 8

@@ -1,4 +1,4 @@
-"""Numbers that are not finite: which quantity had them first, and how the seed that met them stops alone."""
+"""Numbers that are not finite: name the quantity that had them first, and stop the seed that met them alone."""
 
 from collections.abc import Callable
 from typing import Any
@@ -11,7 +11,7 @@ from jaxtyping import Array, Int
 from taic_jax.types import select
 
 QUANTITIES = ("window", "action", "physics", "observation", "reward", "value", "loss", "gradient")
-"""What is watched; a code is an index into this, and `FINITE` where all is well."""
+"""The quantities that are watched; a code is an index into this, or `FINITE`."""
 FINITE = -1
 
 

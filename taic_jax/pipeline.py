@@ -1,5 +1,6 @@
 """The main job: collect experience, learn options, train a policy over them, evaluate."""
 
+import dataclasses
 import json
 import sys
 from collections.abc import Callable, Sequence
@@ -10,7 +11,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
 from taic_jax.artifacts.experience import EXPERIENCE, ExperienceStore, gather_experience, num_blocks
 from taic_jax.artifacts.models import OPTIONS, POLICY, describe, load_options, load_policy, save_options, save_policy
@@ -18,20 +18,19 @@ from taic_jax.config import (
     COLLECT,
     Config,
     ConfigError,
-    OptionsConfig,
     Shard,
     collector_is_baseline,
     kept_ticks,
     needs_collect,
 )
+from taic_jax.envs import environment_options, make_env
 from taic_jax.envs.base import Env
-from taic_jax.envs.errors import RenderingError
+from taic_jax.envs.errors import RenderingError, UnknownNameError
 from taic_jax.networks import PolicyParams
 from taic_jax.nonfinite import FINITE
 from taic_jax.options import learning
 from taic_jax.options.dataset import Dataset, Experience, holds_out, make_dataset
-from taic_jax.options.learning import LearnState
-from taic_jax.options.model import OptionModel, make_networks
+from taic_jax.options.model import OptionModel
 from taic_jax.rl.normalize import Statistics
 from taic_jax.runtime.devices import make_devices
 from taic_jax.runtime.driver import CLOCK, Clock, Run, drive
@@ -39,11 +38,17 @@ from taic_jax.runtime.files import save_text
 from taic_jax.runtime.logging import RunLogger
 from taic_jax.runtime.run_folder import check_folder, claimed, log_folder, prepare_folder
 from taic_jax.summary import as_summary, write_video
-from taic_jax.tasks import make_envs
-from taic_jax.trainer import Trained, assess_rows, init_rows, make_trainer, step_rows
+from taic_jax.trainer import (
+    Trained,
+    assess_rows,
+    init_learning,
+    init_rows,
+    learn_rows,
+    make_trainer,
+    step_rows,
+    steps_per_log,
+)  # fmt: skip
 from taic_jax.types import as_rows
-
-STEPS_PER_LOG = 100
 
 
 def run_pipeline(
@@ -116,6 +121,46 @@ def check_run(
     take_over(config, env, source)
     if run_dir:
         check_folder(config, run_dir, resume=resume, overwrite=overwrite)
+    return env, source
+
+
+def make_envs(config: Config) -> tuple[Env, Env]:
+    """Return the task and the environment that experience is collected in.
+
+    Raises:
+      ConfigError: there is no such environment, or options learnt in one do not fit the other.
+    """
+    options = dataclasses.asdict(config.env)
+    field, name = "env.name", options.pop("name")
+    try:
+        env = source = make_env(name, **options)
+        if config.collect.env:
+            field, name = "collect.env", config.collect.env
+            shared = ("backend", "num_threads", *environment_options(name))
+            source = make_env(name, **{option: options[option] for option in shared})
+    except UnknownNameError as error:
+        raise ConfigError(f"{field}: {error}") from None
+    bodies = [(*describe(e).values(),)[1:] for e in (source, env)]
+    if bodies[0] != bodies[1]:
+        raise ConfigError(
+            f"collect.env: expected the body of {config.env.name} (proprioceptive slice, its size, and action size "
+            f"{bodies[1]}), got {config.collect.env} with {bodies[0]}"
+        )
+    if config.train.ppo.reset_at_change and "changed" not in jax.eval_shape(env.reset, jax.random.key(0)).metrics:
+        raise ConfigError(
+            f"train.ppo.reset_at_change: expected a task that changes, as nav2d does with env.change_after, "
+            f"got {config.env.name}, which never does; the nearest valid value is False"
+        )
+    if config.options.views == "all" and len(source.views) == 1 and not config.options.source:
+        raise ConfigError(
+            f"options.views: expected a body with several equal sides, as ant has, got all with {source.name}, "
+            "which has one; the nearest valid value is one"
+        )
+    if config.options.length > env.episode_length:
+        raise ConfigError(
+            f"options.length: expected at most the {env.episode_length} ticks of an episode of {env.name}, "
+            f"got {config.options.length}; the nearest valid value is {env.episode_length}"
+        )
     return env, source
 
 
@@ -217,23 +262,6 @@ def learn(run: Run, env: Env) -> OptionModel:
     model = learning.as_model(state, dataset)
     save_options(run.dir / OPTIONS, model, env, config)
     return model
-
-
-def init_learning(env: Env, config: OptionsConfig, keys: Array) -> LearnState:
-    """Return the states [K] before the first gradient step, for configs [K]."""
-    networks = make_networks(config, env.proprioceptive_size, env.action_size)
-    return jax.vmap(lambda config, key: learning.init(config, networks, key))(config, keys)
-
-
-def learn_rows(states: LearnState, config: OptionsConfig, dataset: Dataset) -> tuple[LearnState, dict, None]:
-    """Take the gradient steps between two rows of the log, of every row."""
-    unit = steps_per_log(config)
-    return jax.vmap(lambda state, config, data: learning.steps(config, unit, state, data))(states, config, dataset)
-
-
-def steps_per_log(config: OptionsConfig) -> int:
-    """Return how many gradient steps make one step of stage learn, so that whole ones make them all."""
-    return max(n for n in range(1, STEPS_PER_LOG + 1) if config.steps % n == 0)
 
 
 def select_windows(run: Run, env: Env) -> Dataset:

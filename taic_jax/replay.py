@@ -14,12 +14,11 @@ from taic_jax.config import COLLECT
 from taic_jax.config_io import load_config
 from taic_jax.envs.base import Env
 from taic_jax.nonfinite import FINITE, QUANTITIES
-from taic_jax.pipeline import init_learning, learn_rows, select_windows
+from taic_jax.pipeline import make_envs, select_windows
 from taic_jax.runtime.checkpoint import ArtifactError, load_tree
 from taic_jax.runtime.driver import Clock, Run
 from taic_jax.runtime.logging import RunLogger
-from taic_jax.tasks import make_envs
-from taic_jax.trainer import init_rows, make_trainer, step_rows
+from taic_jax.trainer import init_learning, init_rows, learn_rows, make_trainer, step_rows
 from taic_jax.types import as_arrays, as_rows
 
 FIELDS = ("stage", "seed", "seeds", "step", "after", "quantity")
@@ -34,25 +33,24 @@ def replay(dump: Path) -> str | None:
     Raises:
       ArtifactError: it is none, or not of this version's kind.
     """
-    told = _read(dump)
+    dumped = _read(dump)
     run_dir = dump.absolute().parents[1]
     config = load_config(run_dir / "config.yaml")
     env, source = make_envs(config)
-    keys = jnp.stack([jax.random.key(config.seed + k) for k in range(told["seeds"])])
+    keys = jnp.stack([jax.random.key(config.seed + k) for k in range(dumped["seeds"])])
     with RunLogger(run_dir, quiet=True) as logger:
         # As many seeds as there were, all in this state and of this point: the program is the one that failed.
         row = load_tree(dump / "config", jax.eval_shape(as_arrays, config))
-        run = Run(as_rows([row], told["seeds"]), keys, run_dir, logger, Clock())
-        step, like, args = _stage(run, env, source, told["stage"])
+        run = Run(as_rows([row], dumped["seeds"]), keys, run_dir, logger, Clock())
+        step, like, args = _stage(run, env, source, dumped["stage"])
         state = load_tree(dump / "state", jax.eval_shape(lambda rows: jax.tree.map(lambda x: x[0], rows), like))
-        states = jax.tree.map(lambda x: jnp.broadcast_to(x, (told["seeds"], *x.shape)), state)
-        _, metrics, extra = run.compile(told["stage"], step, states, *args)(states, *args)
-    seed, code = told["seed"], int(metrics["nonfinite"][told["seed"]])
+        states = jax.tree.map(lambda x: jnp.broadcast_to(x, (dumped["seeds"], *x.shape)), state)
+        _, metrics, extra = run.compile(dumped["stage"], step, states, *args)(states, *args)
+    seed, code = dumped["seed"], int(metrics["nonfinite"][dumped["seed"]])
     if code == FINITE:
         return None
-    return (
-        f"seed {seed}, {told['stage']}, after {told['after']:,}: {QUANTITIES[code]} is not finite{_where(extra, seed)}"
-    )
+    where = _first_bad(extra, seed)
+    return f"seed {seed}, {dumped['stage']}, after {dumped['after']:,}: {QUANTITIES[code]} is not finite{where}"
 
 
 def _stage(run: Run, env: Env, source: Env, stage: str) -> tuple[Any, Any, tuple]:
@@ -69,15 +67,15 @@ def _stage(run: Run, env: Env, source: Env, stage: str) -> tuple[Any, Any, tuple
 
 def _read(dump: Path) -> dict[str, Any]:
     try:
-        told = json.loads((dump / DESCRIPTION).read_text())
+        dumped = json.loads((dump / DESCRIPTION).read_text())
     except (OSError, ValueError):
-        told = None
-    if not isinstance(told, dict) or not set(FIELDS) <= set(told):
+        dumped = None
+    if not isinstance(dumped, dict) or not set(FIELDS) <= set(dumped):
         raise ArtifactError(f"{dump}: expected a folder under dumps of a run, where a seed stopped; got none")
-    return told
+    return dumped
 
 
-def _where(experience: Any, seed: int) -> str:
+def _first_bad(experience: Any, seed: int) -> str:
     """Return the first tick and environment whose numbers are not finite, if experience was recorded."""
     for array in jax.tree.leaves(experience):
         values = np.asarray(array[seed], np.float32)

@@ -1,4 +1,4 @@
-"""What a run leaves behind beside its artifacts: the plan before it, the summary and the video after it."""
+"""The plan before a run, and its summary, table and video after it."""
 
 import subprocess
 from collections.abc import Mapping

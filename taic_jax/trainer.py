@@ -1,4 +1,4 @@
-"""Training of one policy on one task, for one seed: a pytree, so that rows of configs and models are vmapped."""
+"""One step of a stage: training of a policy on a task, or learning of options; both vmapped over rows of configs."""
 
 from functools import partial
 from typing import Any, NamedTuple
@@ -10,17 +10,21 @@ from jaxtyping import Array
 
 from taic_jax.analysis.evaluate import evaluate
 from taic_jax.artifacts.experience import as_experience
-from taic_jax.config import COLLECT, Config, PPOConfig
+from taic_jax.config import COLLECT, Config, OptionsConfig, PPOConfig
 from taic_jax.envs.base import Env
-from taic_jax.options.dataset import Experience
+from taic_jax.options import learning
+from taic_jax.options.dataset import Dataset, Experience
 from taic_jax.options.execution import Executor, IdentityExecutor, OptionExecutor, make_executor
-from taic_jax.options.model import OptionModel
+from taic_jax.options.learning import LearnState
+from taic_jax.options.model import OptionModel, make_networks
 from taic_jax.rl import fine_tune, ppo
 from taic_jax.rl.fine_tune import Tuned
 
+STEPS_PER_LOG = 100
+
 
 class Trainer(struct.PyTreeNode):
-    """Flat PPO, configured by `collect.ppo`; options are actions, each held for `hold` ticks."""
+    """Flat PPO, configured by `collect.ppo`; options are actions, each repeated for `hold` ticks."""
 
     config: Config
     model: OptionModel | None = None
@@ -30,7 +34,7 @@ class Trainer(struct.PyTreeNode):
 
     @property
     def settings(self) -> PPOConfig:
-        """How the policy is trained."""
+        """Settings of PPO."""
         return self.config.collect.ppo
 
     @property
@@ -45,7 +49,7 @@ class Trainer(struct.PyTreeNode):
 
     @property
     def num_steps(self) -> int:
-        """How many steps the budget of ticks buys."""
+        """Whole steps in the budget of ticks."""
         return self.ticks // self.unit
 
     def init(self, key: Array) -> Any:
@@ -74,7 +78,7 @@ class OptionTrainer(Trainer):
 
     @property
     def settings(self) -> PPOConfig:
-        """How the policy is trained."""
+        """Settings of PPO."""
         return self.config.train.ppo
 
     @property
@@ -126,6 +130,23 @@ def step_rows(states: Any, trainer: Trainer) -> tuple[Any, dict, Any]:
 def assess_rows(trainer: Trainer, keys: Array, states: Any) -> dict[str, dict[str, Array]]:
     """Evaluate every row."""
     return jax.vmap(lambda one, key, state: one.assess(key, state))(trainer, keys, states)
+
+
+def init_learning(env: Env, config: OptionsConfig, keys: Array) -> LearnState:
+    """Return the states [K] before the first gradient step, for configs [K]."""
+    networks = make_networks(config, env.proprioceptive_size, env.action_size)
+    return jax.vmap(lambda config, key: learning.init(config, networks, key))(config, keys)
+
+
+def learn_rows(states: LearnState, config: OptionsConfig, dataset: Dataset) -> tuple[LearnState, dict, None]:
+    """Take the gradient steps between two rows of the log, of every row."""
+    unit = steps_per_log(config)
+    return jax.vmap(lambda state, config, data: learning.steps(config, unit, state, data))(states, config, dataset)
+
+
+def steps_per_log(config: OptionsConfig) -> int:
+    """Return how many gradient steps make one step of stage learn, so that whole ones make them all."""
+    return max(n for n in range(1, STEPS_PER_LOG + 1) if config.steps % n == 0)
 
 
 class Trained(NamedTuple):

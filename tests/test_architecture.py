@@ -25,7 +25,7 @@ LAYERS = (
     "artifacts",
     "analysis",
     "trainer",
-    "summary tasks",
+    "summary",
     "pipeline",
     "replay command_line",
     "run sweep",

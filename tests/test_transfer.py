@@ -21,11 +21,10 @@ from tiny_runs import (
 
 from taic_jax import nonfinite, pipeline
 from taic_jax.config import Config, ConfigError, collector_is_baseline, needs_collect
-from taic_jax.pipeline import run_pipeline
+from taic_jax.pipeline import make_envs, run_pipeline
 from taic_jax.runtime.checkpoint import Checkpoints, load_arrays
 from taic_jax.runtime.driver import STAGES
 from taic_jax.summary import plan
-from taic_jax.tasks import make_envs
 
 QUIET = with_fields(CONFIG, evaluate__video_ticks=0)
 SOURCE = with_fields(QUIET, env__name="nav2d_random", options__steps=0)  # a random decoder does as well

@@ -12,13 +12,13 @@ from taic_jax.config import OptionsConfig
 from taic_jax.envs.views import Views, one_view
 from taic_jax.options.model import Scale
 
-# Every tenth stretch of experience is held out where P's error on unseen windows is needed. A stretch is
-# several windows long, so that few of its windows reach into what is learnt from.
+# Every tenth stretch of experience is left out of learning if P's error on unseen windows is needed. A stretch is
+# several windows long, so that few of its windows reach into the others.
 HELD_OUT_EVERY, STRETCH = 10, 8
 
 
 class ShortExperienceError(ValueError):
-    """The experience is too short for what is asked of it."""
+    """The experience is too short to leave a part of it out."""
 
 
 class Experience(struct.PyTreeNode):
@@ -94,23 +94,23 @@ def make_dataset(
     columns = [_candidates(source, config, i * config.parts) for i, source in enumerate(sources)]
     score, part, held_out = (jnp.concatenate(column) for column in zip(*columns, strict=True))
     part = jnp.where(jnp.isfinite(score), part, num_parts)  # where no window may start
-    order, kept = _select(score, part, num_parts, config)
-    group = jnp.where(kept, held_out[order].astype(jnp.int32), 2)
+    order, selected = _select(score, part, num_parts, config)
+    group = jnp.where(selected, held_out[order].astype(jnp.int32), 2)
     starts = order[jnp.argsort(group, stable=True)]
-    count, held = jnp.sum(group == 0, dtype=jnp.int32), jnp.sum(group == 1, dtype=jnp.int32)
+    count, num_held_out = jnp.sum(group == 0, dtype=jnp.int32), jnp.sum(group == 1, dtype=jnp.int32)
     rows: Any = jax.tree.map(lambda *x: jnp.concatenate([_flatten(y) for y in x]), *sources)
     probe = starts[(jnp.arange(100_000.0) * (count.astype(jnp.float32) / 1e5)).astype(jnp.int32)]
     if views is None or config.views == "one":
         views = one_view(rows.obs.shape[-1], rows.action.shape[-1])
-    seen = jax.vmap(views.obs, (0, None))(
+    states = jax.vmap(views.obs, (0, None))(
         jnp.arange(len(views)), jnp.stack([rows.obs[probe], rows.obs[probe + config.length]])
     )
-    state, end = jnp.swapaxes(seen, 0, 1).reshape((2, -1, seen.shape[-1]))
-    return Dataset(rows, starts, count, held, _scale(state), _scale(end - state), views)
+    state, end = jnp.swapaxes(states, 0, 1).reshape((2, -1, states.shape[-1]))
+    return Dataset(rows, starts, count, num_held_out, _scale(state), _scale(end - state), views)
 
 
 def holds_out(config: OptionsConfig) -> bool:
-    """Return whether P's error on windows that were not learnt from is asked for."""
+    """Return whether learning needs P's error on windows that it does not learn from."""
     return config.termination == "predict" and config.delta_unit == "quantile"
 
 
@@ -134,7 +134,7 @@ def _candidates(experience: Experience, config: OptionsConfig, first_part: int) 
 def _select(
     score: Float[Array, " R"], part: Int[Array, " R"], num_parts: int, config: OptionsConfig
 ) -> tuple[Int[Array, " R"], Array]:
-    """Return the rows in order of part and score, and which of them, in this order, are kept."""
+    """Return the rows in order of part and score, and which of them, in this order, are selected."""
     order = jnp.lexsort((-score, part))
     part = part[order]
     sizes = jnp.bincount(part, length=num_parts + 1)

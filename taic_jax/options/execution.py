@@ -1,4 +1,4 @@
-"""Executors: what turns an option into primitive actions, tick by tick (§3.4)."""
+"""Executors turn an option into primitive actions, tick by tick (§3.4)."""
 
 from typing import Any, Protocol, runtime_checkable
 
@@ -28,7 +28,7 @@ class Executor(Protocol):
 
     @property
     def noise_size(self) -> int:
-        """X, how many standard normal numbers `act` and `ended` share each tick."""
+        """X, the standard normal numbers that `act` and `ended` share each tick."""
         ...
 
     def start(self, option: Float[Array, " D"], obs: Float[Array, " S"]) -> Any:
@@ -65,7 +65,7 @@ class IdentityExecutor(struct.PyTreeNode):
 
 
 class Decoding(struct.PyTreeNode):
-    """A running option: its code, D's carry, and what the termination rule remembers of it."""
+    """A running option: its code, D's carry, and the termination rule's memory of it."""
 
     option: Array
     carry: Any
@@ -86,7 +86,7 @@ class OptionExecutor(struct.PyTreeNode):
 
     @property
     def noise_size(self) -> int:
-        """How many standard normal numbers the termination rule takes each tick."""
+        """X, the standard normal numbers that the termination rule takes each tick."""
         return self.termination.noise_size
 
     def start(self, option: Float[Array, " D"], obs: Float[Array, " S"]) -> Decoding:
@@ -97,7 +97,7 @@ class OptionExecutor(struct.PyTreeNode):
     def act(
         self, carry: Decoding, obs: Float[Array, " S"], noise: Array, disturbance: Array | float = 0.0
     ) -> tuple[Decoding, Float[Array, " A"]]:
-        """Emit D's next action, disturbed if so asked, clipped to its bounds."""
+        """Emit D's next action plus a disturbance, clipped to its bounds."""
         state = self.model.state_scale(self._state(obs))
         memory, (action, end_logit) = self._decoder(carry.carry, carry.option, state, method="step")
         action = jnp.clip(action + disturbance, -1.0, 1.0)

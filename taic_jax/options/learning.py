@@ -24,7 +24,7 @@ DELTA_MEMORY = 100.0
 
 
 class LearnState(struct.PyTreeNode):
-    """Everything a learning run is: saved and restored whole; `delta` [] is the threshold in force."""
+    """The whole state of learning, saved and restored as one tree; `delta` [] is the threshold in force."""
 
     params: dict
     optimizer: optax.OptState
@@ -116,7 +116,7 @@ def step(config: OptionsConfig, dataset: Dataset, state: LearnState) -> tuple[Le
     windows = _draw(config, dataset, key_windows, jnp.zeros((), jnp.int32), dataset.count)
     noise = [jax.random.normal(key_option, (config.batch_size, config.size))]
     if config.decoder == "closed":
-        key_states = jax.random.fold_in(key_option, 1)  # what else is drawn stays as it was before there was this noise
+        key_states = jax.random.fold_in(key_option, 1)  # apart, so that a decoder in open loop draws the same
         noise.append(config.state_noise * jax.random.normal(key_states, windows.states[:, :-1].shape))
     model = as_model(state, dataset)
     gradient, losses = jax.grad(total_loss, has_aux=True)(state.params, model, config, windows, *noise)
@@ -179,7 +179,7 @@ def learn(
     """Learn an option model from experience [T, B, ...]; pure, so experiences and keys may be vmapped.
 
     Several experiences, of tasks that share the body, are merged. Returns the model and the losses of every step,
-    leading axis the step. Where `config.views` is all, windows are seen in all `views` of the body (`Env.views`).
+    leading axis the step. With `config.views` all, windows are learnt from in all `views` of the body (`Env.views`).
 
     Raises:
       ShortExperienceError: delta is a quantile, and there is no experience long enough to hold a part of it out.

@@ -1,6 +1,6 @@
 """Termination rules beta(s, o): when a running option ends before the longest it may take (§3.4).
 
-A rule is what the executor asks after every tick. What it must remember of the running option is its `memory`.
+The executor asks its rule after every tick. `memory` is the state that a rule carries for the running option.
 """
 
 from dataclasses import dataclass
@@ -103,7 +103,7 @@ class Output:
 
 
 class Following(struct.PyTreeNode):
-    """What termination predict remembers: the option's first state, E's carry, and the option E sees so far."""
+    """Memory of termination predict: the option's first state, E's carry, and the option E reads so far."""
 
     start: Array
     carry: Carry

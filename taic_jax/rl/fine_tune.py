@@ -52,7 +52,7 @@ class NoisyExecutor(struct.PyTreeNode):
 
     @property
     def noise_size(self) -> int:
-        """How many standard normal numbers a tick takes: those of the inner executor, then one per action."""
+        """X, the standard normal numbers of a tick: those of the inner executor, then one per action."""
         return self.inner.noise_size + self.inner.model.networks.decoder.action_size
 
     def start(self, option: Float[Array, " D"], obs: Float[Array, " S"]) -> Decoding:
@@ -69,7 +69,7 @@ class NoisyExecutor(struct.PyTreeNode):
 
 
 class Actions(struct.PyTreeNode):
-    """What D's loss needs of R ticks: D's inputs, what was drawn, with which likelihood, and how it paid."""
+    """R ticks as D's loss reads them: D's inputs, the action before clipping, its likelihood and its advantage."""
 
     option: Array
     state: Array

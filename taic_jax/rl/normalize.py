@@ -14,7 +14,7 @@ with third_party():
     from brax.training.acme import running_statistics
 
 Statistics = running_statistics.RunningStatisticsState
-"""Mean and standard deviation of everything seen so far, with a 64-bit count."""
+"""Mean and standard deviation of all data so far, with a 64-bit count."""
 
 
 CARRIED = 1000
@@ -26,17 +26,17 @@ def init(shape: tuple[int, ...] = ()) -> Statistics:
 
 
 def carry_over(statistics: Statistics, shared: int, size: int) -> Statistics:
-    """Return statistics of `size` entries of which the first `shared` are known from elsewhere.
+    """Return statistics of `size` entries of which the first `shared` are those of another run.
 
     They weigh as much as `CARRIED` observations, so that those of the new task soon outweigh them; the other entries
     start at mean 0 and standard deviation 1.
     """
-    known: Any = statistics
-    mean = jnp.zeros(size).at[:shared].set(known.mean[:shared])
-    std = jnp.ones(size).at[:shared].set(known.std[:shared])
-    count = known.count
+    source: Any = statistics
+    mean = jnp.zeros(size).at[:shared].set(source.mean[:shared])
+    std = jnp.ones(size).at[:shared].set(source.std[:shared])
+    count = source.count
     count = count.replace(hi=jnp.zeros_like(count.hi), lo=jnp.full_like(count.lo, CARRIED))
-    return known.replace(count=count, mean=mean, std=std, summed_variance=CARRIED * jnp.square(std))
+    return source.replace(count=count, mean=mean, std=std, summed_variance=CARRIED * jnp.square(std))
 
 
 def update(statistics: Statistics, batch: Float[Array, "..."]) -> Statistics:
@@ -62,7 +62,7 @@ class RewardScale(struct.PyTreeNode):
 
 
 def init_reward_scale(num_envs: int) -> RewardScale:
-    """Return the scale before any reward was seen."""
+    """Return the scale before the first reward."""
     return RewardScale(init(), jnp.zeros(num_envs))
 
 

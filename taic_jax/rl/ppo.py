@@ -26,7 +26,7 @@ from taic_jax.types import Scalar, as_arrays
 
 
 class TrainState(struct.PyTreeNode):
-    """Everything a training run is: saved and restored whole."""
+    """The whole state of training, saved and restored as one tree."""
 
     params: PolicyParams
     optimizer: optax.OptState
@@ -38,7 +38,7 @@ class TrainState(struct.PyTreeNode):
 
 
 class Agent(struct.PyTreeNode):
-    """All that is needed to act: a policy over options with its parameters, and what executes the options."""
+    """A policy over options with its parameters, and the executor of the options: all that acting needs."""
 
     executor: Executor
     params: PolicyParams

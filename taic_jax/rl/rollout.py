@@ -1,7 +1,7 @@
 """Options in lockstep ticks: the one rollout of both levels.
 
-Every tick every environment takes one real step. Where the running option ended the policy decides on a new
-one; then the executor emits the next action; then the termination rule is asked.
+Every tick every environment takes one real step. The policy decides on a new option wherever the last one ended; then
+the executor emits the next action; then the termination rule says whether the option ends.
 """
 
 from collections.abc import Callable
@@ -23,7 +23,7 @@ DecideFn = Callable[[Array, Array], tuple[Array, Array]]
 
 
 class RolloutCarry(struct.PyTreeNode):
-    """What is carried from tick to tick, leading axis B."""
+    """The state between two ticks, leading axis B."""
 
     env: State
     option: Any
@@ -97,7 +97,7 @@ def nothing(state: State) -> None:
 
 
 def count_durations(ticks: Rollout, length: int, where: Array | bool = True) -> Float[Array, " L"]:
-    """Return how many options ended after 1, 2, ... `length` ticks, among the ticks [T, B] where asked."""
+    """Return how many options ended after 1, 2, ... `length` ticks, among the ticks [T, B] that `where` selects."""
     ended = ticks.ended & where
     with jax.numpy_rank_promotion("allow"):
         counts = ended[..., None] & (ticks.duration[..., None] == jnp.arange(1, length + 1))
@@ -117,12 +117,12 @@ def rollout(
 
     Args:
       env: an environment that resets itself (`AutoReset`).
-      executor: what turns an option into actions.
+      executor: turns an option into actions.
       decide: the policy.
       running: from `start` or from the previous rollout.
       key: consumed.
       length: T.
-      keep: what else to record of the state after each tick (before a reset: reward and metrics only).
+      keep: extras to record of the state after each tick (before a reset: reward and metrics only).
     """
     num_envs = running.ended.shape[0]
     noise = jax.random.normal(key, (length, num_envs, executor.option_size + executor.noise_size))

@@ -19,7 +19,7 @@ LOSSES = ("policy_loss", "value_loss", "entropy", "approx_kl", "clip_fraction")
 
 
 class Decisions(struct.PyTreeNode):
-    """What the loss needs of R decisions."""
+    """R decisions as the loss reads them."""
 
     obs: Array
     option: Array
@@ -65,7 +65,7 @@ def ppo_loss(
 
 
 class Update(struct.PyTreeNode):
-    """What updates change: parameters, optimiser state, and the sum of the loss terms."""
+    """The carry of updates: parameters, optimiser state, and the sum of the loss terms."""
 
     params: PolicyParams
     optimizer: optax.OptState
@@ -96,8 +96,8 @@ def _minibatch(
 def shuffled(chosen: Bool[Array, " R"], key: Key[Array, ""]) -> UInt32[Array, " R"]:
     """Return the rows' indices: the chosen ones first, in random order.
 
-    Index and random bits are sorted as one integer, which XLA does four times as fast as it sorts pairs. Rows whose
-    bits are equal keep their order, which tells only where they lie at an edge between minibatches.
+    Index and random bits are sorted as one integer, which XLA does four times as fast as it sorts pairs. Rows of
+    equal bits stay in order, which matters only at an edge between minibatches.
     """
     width = max(1, (len(chosen) - 1).bit_length())
     index = jnp.arange(len(chosen), dtype=jnp.uint32)
