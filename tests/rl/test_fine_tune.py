@@ -89,7 +89,7 @@ def test_likelihoods_are_of_the_actions_that_were_taken(decoder):
     # After an iteration, whose last options go on in the next.
     state = tune(dataclasses.replace(FINE, learning_rate=jnp.zeros(())), executor, 1)[1][0]
     noisy = fine_tune.NoisyExecutor(executor, FINE.std)
-    _, _, ticks, judgement = ppo.iterate(PPO, Forward(), noisy, ITERATIONS, state)
+    _, _, ticks, judgement = jax.jit(lambda state: ppo.iterate(PPO, Forward(), noisy, ITERATIONS, state))(state)
     rows = fine_tune._rows(PPO, noisy, state.running.option.option, ticks, judgement)
     np.testing.assert_allclose(np.clip(rows.action, -1, 1), ticks.action.reshape(-1, 1), atol=1e-5)
     assert rows.duration.min() == 0 and rows.duration.max() == L - 1
