@@ -58,8 +58,8 @@ def stratified_interval(groups: Sequence[ArrayLike], seed: int = 0) -> tuple[np.
         groups: [K, ...] each, one row per seed; a group is a task, or what else must not lend seeds to another.
         seed: of the resampling.
     """
-    values = np.concatenate([np.asarray(group, np.float64) for group in groups])
-    resamples = _resamples(np.random.default_rng(seed), *map(len, groups))
+    arrays = [np.asarray(group, np.float64) for group in groups]
+    values, resamples = np.concatenate(arrays), _resamples(np.random.default_rng(seed), *map(len, arrays))
     low, high = _interval([iqm(values[rows], axis=0) for rows in resamples], (1 - 0.95) / 2)
     return low, high
 
@@ -70,7 +70,7 @@ def _resamples(random: np.random.Generator, *sizes: int) -> np.ndarray:
     return starts + random.integers(np.repeat(sizes, sizes), size=(BOOTSTRAP_DRAWS, sum(sizes)))
 
 
-def _interval(draws: ArrayLike, tail: float) -> np.ndarray:
+def _interval(draws: Any, tail: float) -> np.ndarray:
     """Return the quantiles of draws [draws, ...] that cut off `tail` at either end."""
     return np.quantile(draws, [tail, 1 - tail], axis=0)
 

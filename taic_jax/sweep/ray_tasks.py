@@ -35,23 +35,20 @@ def connect(address: str) -> None:
     Raises:
       ConfigError: it does not answer in time, or is of another version.
     """
-    if address != LOCAL:
-        # In a process of its own: Ray waits for longer, and cannot be told to stop waiting.
-        command = [sys.executable, "-c", _PROBE, address]
-        try:
-            probe = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE)
-        except subprocess.TimeoutExpired:
-            raise ConfigError(_unanswered(address, f"in {PATIENCE:.0f} s")) from None
-        if probe.returncode:
-            last = (probe.stderr.strip().splitlines() or [""])[-1]
-            raise ConfigError(_unanswered(address, f"({last})"))
+    if address != LOCAL and (problem := _probe(address)):
+        expected = f"expected the HOST:PORT of a Ray cluster, got no answer of {address} {problem}"
+        raise ConfigError(f"--cluster: {expected}; {LOCAL} starts one here")
     ray.init(address, logging_level=logging.ERROR, namespace="taic_jax")
 
 
-def _unanswered(address: str, how: str) -> str:
-    return (
-        f"--cluster: expected the HOST:PORT of a Ray cluster, got no answer of {address} {how}; {LOCAL} starts one here"
-    )
+def _probe(address: str) -> str | None:
+    """Return what keeps a cluster from answering; in a process of its own, as Ray waits longer and cannot be told."""
+    command = [sys.executable, "-c", _PROBE, address]
+    try:
+        probe = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE)
+    except subprocess.TimeoutExpired:
+        return f"in {PATIENCE:.0f} s"
+    return f"({(probe.stderr.strip().splitlines() or [''])[-1]})" if probe.returncode else None
 
 
 def run_tasks(work: Callable[..., Any], tasks: Sequence[tuple], signals: Signals | None = None) -> Iterator[Any]:
