@@ -115,7 +115,7 @@ def measure(
 
     Args:
       env: the task they are executed in.
-      config, model, experience: how the options of one seed were learnt, and from what.
+      config, model, experience: of one seed: the model, and what it was learnt with and from.
       key: consumed.
       count: options of each kind, N.
 

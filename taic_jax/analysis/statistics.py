@@ -55,7 +55,7 @@ def stratified_interval(groups: Sequence[ArrayLike], seed: int = 0) -> tuple[np.
     """Return the 95 % bootstrap interval of the interquartile mean over all groups, each resampled by itself.
 
     Args:
-        groups: [K, ...] each, one row per seed; a group is a task, or what else must not lend seeds to another.
+        groups: [K, ...] each, one row per seed; a group is a task, or else must not lend seeds to another.
         seed: of the resampling.
     """
     arrays = [np.asarray(group, np.float64) for group in groups]

@@ -1,6 +1,6 @@
 """Sweeps: `python -m taic_jax.sweep CONFIG --axes FIELD=V1,V2 ... [--samples N | --optuna N]`.
 
-Points that differ in numbers alone run with all their seeds in one program; what is static splits them into several.
+Points that differ in numbers alone run with all their seeds in one program; static fields split them into several.
 """
 
 import importlib

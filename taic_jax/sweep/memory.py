@@ -63,7 +63,7 @@ def _step_bytes(rows: Config, env: Any, stage: str, keys: jax.Array) -> int:
 
 
 def _experience(config: Config, env: Any) -> list[Experience]:
-    """Return the shapes of what options are learnt from, one row of each source."""
+    """Return the shapes of the experience that options are learnt from, one row of each source."""
     ppo = config.collect.ppo
     ticks = min(num_blocks(config.collect) * ppo.rollout_length, config.collect.ticks // ppo.num_envs)
     shapes = [(1, ticks, ppo.num_envs, *last) for last in ([env.proprioceptive_size], [env.action_size], [], [])]

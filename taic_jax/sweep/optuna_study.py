@@ -17,7 +17,7 @@ JOURNAL = "optuna.log"
 
 
 class Study:
-    """Suggest points along the axes by what came of earlier ones, the higher the better.
+    """Suggest points along the axes from the results of earlier ones, the higher the better.
 
     The journal is in `run_dir`; a study that is in it goes on. `seed` is the sampler's.
     """
@@ -32,7 +32,7 @@ class Study:
         }
         self._values = {axis.name: {str(value): value for value in axis.values} for axis in axes if not axis.is_range}
         storage = optuna.storages.JournalStorage(JournalFileBackend(str(run_dir / JOURNAL)))
-        # A point of a batch is asked for before the others' results are known: the liar keeps them apart.
+        # The points of a batch are suggested before any of them has a result: the liar keeps them apart.
         sampler = optuna.samplers.TPESampler(seed=seed, constant_liar=True)
         self._study = optuna.create_study(
             storage=storage, study_name="sweep", direction="maximize", sampler=sampler, load_if_exists=True

@@ -20,12 +20,9 @@ except ImportError:
     raise MissingExtraError("ray", "cluster") from None
 
 LOCAL = "local"
-PATIENCE = 15.0
-"""Seconds in which a cluster must answer."""
-RETRIES = 100
-"""How many nodes a task may lose."""
-RELEASE = 60.0
-"""Seconds that a task waits for the process of a lost node to let go of the folder."""
+PATIENCE = 15.0  # seconds in which a cluster must answer
+RETRIES = 100  # nodes that a task may lose
+RELEASE = 60.0  # seconds that a task waits for the process of a lost node to let go of the folder
 _PROBE = "import ray, sys; ray.init(sys.argv[1], logging_level='ERROR', log_to_driver=False)"
 
 
@@ -42,7 +39,7 @@ def connect(address: str) -> None:
 
 
 def _probe(address: str) -> str | None:
-    """Return what keeps a cluster from answering; in a process of its own, as Ray waits longer and cannot be told."""
+    """Return why a cluster does not answer, if so; another process tries, as Ray waits longer and cannot be stopped."""
     command = [sys.executable, "-c", _PROBE, address]
     try:
         probe = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE)
@@ -52,7 +49,7 @@ def _probe(address: str) -> str | None:
 
 
 def run_tasks(work: Callable[..., Any], tasks: Sequence[tuple], signals: Signals | None = None) -> Iterator[Any]:
-    """Yield what `work(*task)` returns for each of the tasks, in the order in which they end.
+    """Yield the result of `work(*task)` for each of the tasks, in the order in which they end.
 
     A task takes a whole node of the smallest kind there is, and runs in this process's folder, which all nodes share.
     """

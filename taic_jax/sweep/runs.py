@@ -68,7 +68,7 @@ def run_sweep(
     on_cluster: bool = False,
     **settings: Any,
 ) -> None:
-    """Run what is missing, and write the table after every chunk, the best point and the marginal plots at the end.
+    """Run the missing chunks; write the table after each, and at the end the best point and the marginal plots.
 
     Raises:
       Interrupted: a signal was received; resume goes on from where it came.
@@ -135,12 +135,12 @@ def run_chunk(config: Config, plan: Plan, run_dir: Path, settings: dict[str, Any
             save_json(folder.summary_path, {"methods": {}})
     for name in (EXPERIENCE, "checkpoints"):  # only needed to go on; a sweep that was killed here may have left some
         shutil.rmtree(folder.path / name, ignore_errors=True)
-    methods = folder.summary()["methods"]
-    diverged = dict.fromkeys(("per_seed", "first_per_seed"), [None] * (len(indices) * config.seeds))
-    returns = methods["taic"]["return"] if methods else diverged
-    last, first = (
-        np.array(values, float).reshape(len(indices), -1) for values in (returns["per_seed"], returns["first_per_seed"])
-    )
+    if methods := folder.summary()["methods"]:
+        returns = methods["taic"]["return"]
+        both = np.array([returns["per_seed"], returns["first_per_seed"]], float)
+    else:  # every seed diverged
+        both = np.full((2, len(indices) * config.seeds), np.nan)
+    last, first = both.reshape(2, len(indices), config.seeds)
     return [_row(config, plan, i, *pair) for i, *pair in zip(indices, last, first, strict=True)]
 
 
