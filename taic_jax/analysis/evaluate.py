@@ -19,9 +19,8 @@ def evaluate(env: Env, agent: Agent, key: Key[Array, ""], episodes: int, explora
 
     Args:
       env: the task, not yet wrapped to reset itself.
-      agent: what acts.
+      agent, episodes: the policy that acts, and in how many episodes.
       key: consumed.
-      episodes: number of episodes.
       exploration: scale of the policy's noise; 0 takes its mean options.
 
     Returns:
@@ -29,7 +28,7 @@ def evaluate(env: Env, agent: Agent, key: Key[Array, ""], episodes: int, explora
       (`mean/NAME`) and its value at the last tick (`final/NAME`); and `durations` [L], how many options took
       1, 2, ... L ticks.
     """
-    ticks = _run(env, agent, key, episodes, env.episode_length, exploration, _metrics)
+    ticks = _run(env, agent, key, episodes, env.episode_length, exploration, lambda state: state.metrics)
     done = (ticks.terminated | ticks.truncated).astype(jnp.float32)
     first = (jnp.cumsum(done, axis=0) - done == 0).astype(jnp.float32)
     length = jnp.sum(first, axis=0)
@@ -43,16 +42,8 @@ def evaluate(env: Env, agent: Agent, key: Key[Array, ""], episodes: int, explora
 
 def record(env: Env, agent: Agent, key: Key[Array, ""], ticks: int) -> Any:
     """Return `ticks` ticks of physics [T, ...] of one environment under the mean options, for `env.render`."""
-    run = _run(env, agent, key, 1, ticks, 0.0, _physics)
+    run = _run(env, agent, key, 1, ticks, 0.0, lambda state: state.physics)
     return jax.tree.map(lambda x: x[:, 0], run.extras)
-
-
-def _metrics(state: State) -> dict[str, Array]:
-    return state.metrics
-
-
-def _physics(state: State) -> Any:
-    return state.physics
 
 
 def _run(

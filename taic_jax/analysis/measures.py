@@ -1,7 +1,8 @@
 """Measures of an option space: how much of what an option does can be read from its code, and how smoothly.
 
-Rows are windows; x is the option [N, D] and y the state change [N, P], as a rule. All run on the host, and only the
+Rows are windows; x [N, D] is the option and y [N, P] the state change, as a rule. All run on the host, and only the
 MLP probe in JAX. Distances between all rows take N^2 numbers of 8 bytes: of more than some 2000 rows draw a sample.
+Shapes that do not fit, too few rows, and rows with a number that is not finite raise ValueError.
 """
 
 from typing import Any
@@ -38,9 +39,6 @@ def measure_option_space(option: ArrayLike, start: ArrayLike, end: ArrayLike, se
         option: [N, D], N at least 25.
         start, end: [N, P].
         seed: of the probes' held-out rows, of the MLP and of the permutations.
-
-    Raises:
-        ValueError: shapes that do not fit, or rows with a number that is not finite.
     """
     option, start = _pair(option, start, "option", "start")
     end = _finite_rows(end, "end")
@@ -65,10 +63,8 @@ def distance_correlation(x: ArrayLike, y: ArrayLike) -> float:
 
     0 for independent and 1 for similar point clouds (equal up to rotation, shift and one scale). The plain statistic
     of Székely, Rizzo & Bakirov (2007) tends to 1 with the number of columns even for independent ones. The corrected
-    one may fall a little below 0 and therefore has no root: it estimates the square, on the scale of R^2.
-
-    Args:
-        x, y: [N, D] and [N, P], N at least 4. If all rows of either are equal, the result is 0.
+    one may fall a little below 0 and therefore has no root: it estimates the square, on the scale of R^2. If all of
+    the at least 4 rows of x or of y are equal, it is 0.
     """
     x, y = _pair(x, y)
     if len(x) < 4:
@@ -84,11 +80,7 @@ def trustworthiness(x: ArrayLike, y: ArrayLike, k: int = 10) -> float:
     1 - 2 / (N k (2N - 3k - 1)) sum_i sum_{j in U_i} (r(i, j) - k), where U_i holds those of the k rows nearest to i
     in x that are not among the k nearest in y, and r(i, j) is j's rank from i in y (1 is nearest). 1 says that near
     options change the state nearly alike; unrelated x and y give about 0.5. With x and y exchanged it is the
-    continuity: whether near changes come from near options.
-
-    Args:
-        x, y: [N, D] and [N, P].
-        k: size of the neighbourhoods, less than N / 2.
+    continuity: whether near changes come from near options. `k` must be less than N / 2.
     """
     x, y = _pair(x, y)
     rows = len(x)
@@ -103,16 +95,13 @@ def trustworthiness(x: ArrayLike, y: ArrayLike, k: int = 10) -> float:
 def linear_probe_r2(x: ArrayLike, y: ArrayLike, seed: int = 0) -> float:
     """Return the R^2, on held-out rows, of ridge regression from x to y: a linear probe (Alain & Bengio, 2017).
 
-    A fifth of the rows, drawn by the seed, is held out. All columns are standardised by mean and standard deviation
-    of the other rows, the training rows, and the penalty is 0.001 per row. R^2 = 1 - sum (y - prediction)^2 / sum y^2,
-    each over all held-out rows and all columns: every column that varies weighs about alike, and predicting the mean
-    of the training rows gives exactly 0. Below 0 is worse than that; nothing is clipped. A constant y gives NaN.
+    A fifth of the rows (N is at least 25), drawn by the seed, is held out. All columns are standardised by mean and
+    standard deviation of the training rows, which are the others, and the penalty is 0.001 per row.
+    R^2 = 1 - sum (y - prediction)^2 / sum y^2, each over all held-out rows and all columns: every column that varies
+    weighs about alike, and predicting the mean of the training rows gives exactly 0. Below 0 is worse than that;
+    nothing is clipped. A constant y gives NaN.
 
-    Rows of one episode are alike: held-out rows from episodes seen in training flatter a probe.
-
-    Args:
-        x, y: [N, D] and [N, P], N at least 25.
-        seed: of the held-out rows, which are those of `mlp_probe_r2`.
+    Rows of one episode are alike: held-out rows from episodes of the training rows flatter a probe.
     """
     x, y, held_out_x, held_out_y = _split(x, y, seed)
     gram = x.T @ x / len(x) + RIDGE_PENALTY * np.eye(x.shape[1])
@@ -126,11 +115,7 @@ def mlp_probe_r2(x: ArrayLike, y: ArrayLike, seed: int = 0) -> float:
     It has two hidden layers of 64 and takes 300 steps of Adam on all training rows but a fifth; this fifth chooses
     the step whose parameters count (early stopping; Prechelt, 1998). An untrained MLP predicts nearly 0, so where x
     and y are unrelated an early step is chosen, and R^2 is near 0. With a state as y it is F trained anew: it may
-    find what F, trained against a moving encoder, did not.
-
-    Args:
-        x, y: [N, D] and [N, P], N at least 25.
-        seed: of the held-out rows and of the MLP's parameters.
+    find information that F, trained against a moving encoder, missed.
     """
     x, y, held_out_x, held_out_y = (jnp.asarray(part, jnp.float32) for part in _split(x, y, seed))
     stop = len(x) // 5
@@ -149,7 +134,7 @@ def mutual_information(x: ArrayLike, y: ArrayLike, k: int = 3, components: int |
 
     Args:
         x, y: [N, D] and [N, P].
-        k: neighbours, less than N; more of them lower the variance and raise the bias.
+        k: number of neighbours, less than N; more of them lower the variance and raise the bias.
         components: project y onto this many of its first principal components; None leaves y whole.
     """
     return _kraskov(*_max_norms(x, y, k, components), k)
@@ -158,15 +143,9 @@ def mutual_information(x: ArrayLike, y: ArrayLike, k: int = 3, components: int |
 def permutation_baseline(
     x: ArrayLike, y: ArrayLike, draws: int = PERMUTATIONS, seed: int = 0, k: int = 3, components: int | None = None
 ) -> tuple[float, float]:
-    """Return mean and 95 % quantile of `mutual_information` with the rows of y permuted, so that nothing is shared.
+    """Return mean and 95 % quantile of `mutual_information` over permutations of the rows of y, which share nothing.
 
     About 5 % of unrelated pairs reach an estimate above the quantile (François et al., 2006).
-
-    Args:
-        x, y: [N, D] and [N, P].
-        draws: number of permutations.
-        seed: of the permutations.
-        k, components: as in `mutual_information`.
     """
     x_distances, y_distances = _max_norms(x, y, k, components)
     rng = np.random.default_rng(seed)
@@ -176,22 +155,14 @@ def permutation_baseline(
 
 
 def active_dimensions(mean: ArrayLike) -> int:
-    """Return how many dimensions of q(o|a) vary with the window: Var(mean) > 0.01 (Burda et al., 2016).
-
-    Args:
-        mean: [N, D], the posterior's means of N windows.
-    """
+    """Return how many dimensions of q(o|a), of means [N, D], vary with the window: Var > 0.01 (Burda et al., 2016)."""
     return int(np.sum(np.var(_finite_rows(mean, "mean"), axis=0) > ACTIVE_VARIANCE))
 
 
 def kl_per_dimension(mean: ArrayLike, log_std: ArrayLike) -> np.ndarray:
     """Return each dimension's share [D] of L_KL (eq. 2) in nats, the mean over windows (Kingma & Welling, 2014, B).
 
-    KL(N(m, s^2) || N(0, 1)) = (m^2 + s^2 - 1) / 2 - ln s.
-
-    Args:
-        mean: [N, D], the posterior's means.
-        log_std: [N, D], the logarithms of its standard deviations.
+    KL(N(m, s^2) || N(0, 1)) = (m^2 + s^2 - 1) / 2 - ln s, where m and ln s are the posterior's [N, D].
     """
     mean, log_std = _pair(mean, log_std, "mean", "log_std")
     return np.mean((mean**2 + np.exp(2 * log_std) - 1) / 2 - log_std, axis=0)
@@ -226,9 +197,9 @@ def _split(x: ArrayLike, y: ArrayLike, seed: int) -> tuple[np.ndarray, np.ndarra
     x, y = _pair(x, y)
     if len(x) < 25:
         raise ValueError(f"a probe needs at least 25 rows, got {len(x)}")
-    held_out, kept = np.split(np.random.default_rng(seed).permutation(len(x)), [len(x) // 5])
-    x, y = standardized(x, x[kept]), standardized(y, y[kept])
-    return x[kept], y[kept], x[held_out], y[held_out]
+    held_out, train = np.split(np.random.default_rng(seed).permutation(len(x)), [len(x) // 5])
+    x, y = standardized(x, x[train]), standardized(y, y[train])
+    return x[train], y[train], x[held_out], y[held_out]
 
 
 def _r2(predicted: np.ndarray, y: np.ndarray) -> float:
@@ -279,17 +250,15 @@ def _u_centred(values: np.ndarray) -> np.ndarray:
 
 
 def _max_norms(x: ArrayLike, y: ArrayLike, k: int, components: int | None) -> tuple[np.ndarray, np.ndarray]:
-    """Return distances [N, N] by the maximum norm in x and in the projection of y."""
+    """Return distances [N, N] by the maximum norm in x, and in y or its first principal components."""
     x, y = _pair(x, y)
     if not 1 <= k < len(x):
         raise ValueError(f"k must be at least 1 and less than the {len(x)} rows, got {k}")
-    projected = y if components is None else _principal_components(y, components)
+    projected: np.ndarray = y
+    if components is not None:
+        centred = y - y.mean(axis=0)
+        projected = centred @ np.linalg.svd(centred, full_matrices=False)[2][:components].T
     return _distances(x, "chebyshev"), _distances(projected, "chebyshev")
-
-
-def _principal_components(values: np.ndarray, count: int) -> np.ndarray:
-    centred = values - values.mean(axis=0)
-    return centred @ np.linalg.svd(centred, full_matrices=False)[2][:count].T
 
 
 def _kraskov(x_distances: np.ndarray, y_distances: np.ndarray, k: int) -> float:

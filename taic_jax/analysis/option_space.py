@@ -1,11 +1,10 @@
-"""What options do when they are executed from chosen states, and how orderly that makes the option space (§4.2.1)."""
+"""Effects of options that are executed from chosen states, and how orderly they make the option space (§4.2.1)."""
 
 from collections.abc import Sequence
 from functools import partial
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, Key
 
@@ -43,31 +42,25 @@ def execute(
 ) -> Effects:
     """Execute each option once, until its termination rule or the episode ends it.
 
-    Args:
-      env: the task, not yet wrapped to reset itself.
-      executor: of these options.
-      option: codes to execute.
-      key: consumed.
-      many: begin each in another state, reached by random options; else all in the same first state.
+    With `many`, each begins in another state, reached by random options; else all begin in the same first state.
+    `env` is the task, not yet wrapped to reset itself; the key is consumed.
     """
     key_start, key_warm_up, key_noise = jax.random.split(key, 3)
     env, num_options = AutoReset(env), len(option)
     begin = start(env, executor, num_options, key_start)
     if many:
-        begin, _ = rollout(env, executor, _prior, begin, key_warm_up, WARM_UP)
+        begin, _ = rollout(env, executor, _from_prior, begin, key_warm_up, WARM_UP)
         begin = begin.replace(ended=jnp.ones_like(begin.ended))
     else:
         first = jax.tree.map(lambda x: jnp.broadcast_to(x[:1], x.shape), begin.env.replace(key=None))
         begin = begin.replace(env=first.replace(key=begin.env.key))
-    chosen = partial(always, option)
-    _, ticks = rollout(env, executor, chosen, begin, key_noise, executor.length)
-    last = jnp.argmax(ticks.ended, axis=0)
-    size = env.proprioceptive_size
+    _, ticks = rollout(env, executor, partial(always, option), begin, key_noise, executor.length)
+    last, size = jnp.argmax(ticks.ended, axis=0), env.proprioceptive_size
     end = jnp.take_along_axis(ticks.final_obs, last[None, :, None], axis=0)[0]
     return Effects(option, ticks.obs[0, :, :size], end[:, :size], last + 1)
 
 
-def _prior(obs: Float[Array, "B S"], noise: Float[Array, "B D"]) -> tuple[Array, Array]:
+def _from_prior(obs: Float[Array, "B S"], noise: Float[Array, "B D"]) -> tuple[Array, Array]:
     return noise, jnp.zeros(len(noise))
 
 
@@ -105,8 +98,8 @@ def encode_windows(
 ) -> Encoded:
     """Encode `count` windows drawn from the selection, of `config.length` ticks each."""
     dataset = make_dataset(experience, config)
-    which = jax.random.randint(key, (count,), 0, dataset.count)
-    windows = gather(dataset, which, jnp.full(count, config.length), config.length)
+    drawn = jax.random.randint(key, (count,), 0, dataset.count)
+    windows = gather(dataset, drawn, jnp.full(count, config.length), config.length)
     means, log_stds = jax.vmap(model.encode)(windows.actions)
     return Encoded(means[:, -1], log_stds[:, -1], windows.states[:, 0], windows.states[:, -1])
 
@@ -114,13 +107,11 @@ def encode_windows(
 def measure(
     env: Env, config: OptionsConfig, model: OptionModel, experience: Experience, key: Key[Array, ""], count: int = 1000
 ) -> dict[str, float]:
-    """Measure one option model: what its options do from one state and from many, drawn from the prior and from data.
+    """Measure one option model: the effects of options drawn from the prior and from data, from one state and many.
 
     Args:
       env: the task they are executed in.
-      config: with which the model was learnt.
-      model: of one seed.
-      experience: it was learnt from.
+      config, model, experience: of one seed: the model, and what it was learnt with and from.
       key: consumed.
       count: options of each kind, N.
 
@@ -131,15 +122,17 @@ def measure(
     """
     config = as_arrays(config)
     key_prior, key_windows, key_data, *keys = jax.random.split(key, 7)
-    windows = jax.jit(encode_windows, static_argnums=4)(config, model, experience, key_windows, count)
+    encode = jax.jit(encode_windows, static_argnums=4)
+    windows = jax.device_get(encode(config, model, experience, key_windows, count))
     data = windows.mean + jnp.exp(windows.log_std) * jax.random.normal(key_data, windows.mean.shape)
     prior = jax.random.normal(key_prior, data.shape)
     executor = make_executor(config, model)
     run = jax.jit(partial(execute, env), static_argnames="many")
-    mean = np.asarray(windows.mean)
-    kl = kl_per_dimension(mean, np.asarray(windows.log_std))
-    result = {"active_dimensions": float(active_dimensions(mean)), "kl": float(kl.sum())}
-    measured = measure_option_space(np.asarray(data), np.asarray(windows.start), np.asarray(windows.end))
+    result = {
+        "active_dimensions": float(active_dimensions(windows.mean)),
+        "kl": float(kl_per_dimension(windows.mean, windows.log_std).sum()),
+    }
+    measured = measure_option_space(data, windows.start, windows.end)
     result |= {f"window/{name}": value for name, value in measured.items()}
     cases = [(kind, option, many) for kind, option in (("prior", prior), ("data", data)) for many in (False, True)]
     for (kind, option, many), key_run in zip(cases, keys, strict=True):
@@ -147,6 +140,6 @@ def measure(
         measured = measure_option_space(effects.option, effects.start, effects.end)
         measured["ticks"] = float(effects.ticks.mean())
         # From one state the start is constant, and the end is the change.
-        told = {name: value for name, value in measured.items() if many or not name.endswith(("/start", "/end"))}
-        result |= {f"{kind}/{'many' if many else 'one'}/{name}": value for name, value in told.items()}
+        names = [name for name in measured if many or not name.endswith(("/start", "/end"))]
+        result |= {f"{kind}/{'many' if many else 'one'}/{name}": measured[name] for name in names}
     return result

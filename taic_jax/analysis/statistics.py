@@ -7,6 +7,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import stats
 
+from taic_jax.runtime.files import json_safe
+from taic_jax.runtime.run_folder import Statistics
+
 BOOTSTRAP_DRAWS = 2000
 
 
@@ -34,51 +37,47 @@ def bootstrap_interval(values: ArrayLike, seed: int = 0, confidence: float = 0.9
     values = np.asarray(values, np.float64)
     if values.size < 2:
         return float("nan"), float("nan")
-    rows = np.random.default_rng(seed).integers(values.size, size=(BOOTSTRAP_DRAWS, values.size))
-    tail = (1 - confidence) / 2
-    low, high = np.quantile(iqm(values[rows]), [tail, 1 - tail])
+    low, high = _interval(iqm(values[_resamples(np.random.default_rng(seed), values.size)]), (1 - confidence) / 2)
     return float(low), float(high)
 
 
 def probability_of_improvement(x: ArrayLike, y: ArrayLike, seed: int = 0) -> tuple[float, tuple[float, float]]:
-    """Return P(a run of x beats a run of y), ties counted half, and its 95 % bootstrap interval over seeds.
-
-    Args:
-        x, y: [K] and [J], one value per seed.
-        seed: of the resampling.
-    """
+    """Return P(a run of x [K] beats a run of y [J]), ties counted half, and its 95 % bootstrap interval over seeds."""
     x, y = np.asarray(x, np.float64), np.asarray(y, np.float64)
     wins = np.sign(x[:, None] - y[None]) / 2 + 0.5
     random = np.random.default_rng(seed)
-    rows, columns = (random.integers(n, size=(BOOTSTRAP_DRAWS, n)) for n in wins.shape)
-    means = [wins[np.ix_(i, j)].mean() for i, j in zip(rows, columns, strict=True)]
-    low, high = np.quantile(means, [0.025, 0.975])
+    rows, columns = _resamples(random, len(x)), _resamples(random, len(y))
+    low, high = _interval([wins[np.ix_(i, j)].mean() for i, j in zip(rows, columns, strict=True)], 0.025)
     return float(wins.mean()), (float(low), float(high))
 
 
-def stratified_interval(
-    groups: Sequence[ArrayLike], seed: int = 0, confidence: float = 0.95
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the percentile bootstrap interval of the interquartile mean over all groups, each resampled by itself.
+def stratified_interval(groups: Sequence[ArrayLike], seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Return the 95 % bootstrap interval of the interquartile mean over all groups, each resampled by itself.
 
     Args:
-        groups: [K, ...] each, one row per seed; a group is a task, or what else must not lend seeds to another.
+        groups: [K, ...] each, one row per seed; a group is a task, or else must not lend seeds to another.
         seed: of the resampling.
-        confidence: probability mass of the interval.
     """
-    groups, random = [np.asarray(group, np.float64) for group in groups], np.random.default_rng(seed)
-    draws = []
-    for _ in range(BOOTSTRAP_DRAWS):
-        rows = np.concatenate([group[random.integers(len(group), size=len(group))] for group in groups])
-        draws.append(iqm(rows, axis=0))
-    tail = (1 - confidence) / 2
-    low, high = np.quantile(draws, [tail, 1 - tail], axis=0)
+    arrays = [np.asarray(group, np.float64) for group in groups]
+    values, resamples = np.concatenate(arrays), _resamples(np.random.default_rng(seed), *map(len, arrays))
+    low, high = _interval([iqm(values[rows], axis=0) for rows in resamples], (1 - 0.95) / 2)
     return low, high
 
 
-def exact_interval(count: int, total: int, confidence: float = 0.95) -> tuple[float, float]:
-    """Return the interval of a share, `count` of `total`, of Clopper & Pearson (1934): it never covers too little."""
-    interval = stats.binomtest(count, total).proportion_ci(confidence, method="exact")
+def _resamples(random: np.random.Generator, *sizes: int) -> np.ndarray:
+    """Draw rows with replacement, each group's from its own: indices [draws, sum of sizes] into all rows."""
+    starts = np.repeat(np.cumsum([0, *sizes[:-1]]), sizes)
+    return starts + random.integers(np.repeat(sizes, sizes), size=(BOOTSTRAP_DRAWS, sum(sizes)))
+
+
+def _interval(draws: Any, tail: float) -> np.ndarray:
+    """Return the quantiles of draws [draws, ...] that cut off `tail` at either end."""
+    return np.quantile(draws, [tail, 1 - tail], axis=0)
+
+
+def exact_interval(count: int, total: int) -> tuple[float, float]:
+    """Return the 95 % interval of the share `count` of `total`, never too narrow (Clopper & Pearson, 1934)."""
+    interval = stats.binomtest(count, total).proportion_ci(method="exact")
     return float(interval.low), float(interval.high)
 
 
@@ -90,20 +89,9 @@ def holm(p_values: ArrayLike) -> np.ndarray:
     return np.minimum(adjusted, 1.0)[np.argsort(order)]
 
 
-def summarize(per_seed: ArrayLike) -> dict[str, Any]:
-    """Return the values per seed, their mean, their interquartile mean and its 95 % interval, ready for JSON.
-
-    Args:
-        per_seed: [K]. What is not finite becomes None.
-    """
+def summarize(per_seed: ArrayLike) -> Statistics:
+    """Return the values [K], their mean, interquartile mean and 95 % interval; None is what is not finite."""
     values = np.asarray(per_seed, np.float64)
-    return {
-        "per_seed": [_finite(value) for value in values],
-        "mean": _finite(values.mean()),
-        "iqm": _finite(iqm(values)),
-        "ci95": [_finite(bound) for bound in bootstrap_interval(values)],
-    }
-
-
-def _finite(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
+    return json_safe(
+        {"per_seed": values, "mean": values.mean(), "iqm": iqm(values), "ci95": bootstrap_interval(values)}
+    )

@@ -1,6 +1,6 @@
 """Sweeps: `python -m taic_jax.sweep CONFIG --axes FIELD=V1,V2 ... [--samples N | --optuna N]`.
 
-Points that differ in numbers alone run with all their seeds in one program; what is static splits them into several.
+Points that differ in numbers alone run with all their seeds in one program; static fields split them into several.
 """
 
 import importlib
@@ -43,17 +43,16 @@ def main(args: Sequence[str] | None = None) -> int:
 
 def execute(command: Command) -> int:
     """Sweep, or only print the plan; return the exit code."""
-    axes = _check(command)
+    config, axes, points = command.config, _check(command), []
     if command.cluster and not command.dry_run:
         from taic_jax.sweep.ray_tasks import connect
 
         connect(command.cluster)
     if command.optuna:
-        points = []
         importlib.import_module("taic_jax.sweep.optuna_study")  # a missing one is refused before a folder is made
     else:
-        points = sample(axes, command.samples, command.config.seed) if command.samples else grid(axes)
-        configs_of(command.config, points)
+        points = sample(axes, command.samples, config.seed) if command.samples else grid(axes)
+        configs_of(config, points)
     from taic_jax.pipeline import check_run
     from taic_jax.runtime.devices import open_devices
     from taic_jax.runtime.program_cache import keep_programs
@@ -61,23 +60,22 @@ def execute(command: Command) -> int:
     from taic_jax.sweep.runs import TABLE, Plan, run_sweep, sweep_config
 
     keep_programs()
-    asked = "none" if command.pbt and command.shard == "auto" else command.shard
-    shard = open_devices(asked, command.config.seeds * (len(points) or command.optuna))
-    check_run(sweep_config(command.config), command.run_dir, resume=command.resume, overwrite=command.overwrite)
+    shard = "none" if command.pbt and command.shard == "auto" else command.shard
+    shard = open_devices(shard, config.seeds * (len(points) or command.optuna))
+    check_run(sweep_config(config), command.run_dir, resume=command.resume, overwrite=command.overwrite)
     # A sweep that is resumed keeps the chunks that it had: there is nothing to measure.
-    size = command.chunk or (1 if command.resume else points_that_fit(command.config, command.memory))
-    plan = Plan(
-        list(command.axes), command.samples, command.optuna, size, points, chunks(points, size), pbt=command.pbt
-    )
+    size = command.chunk or (1 if command.resume else points_that_fit(config, command.memory))
     if command.pbt and not command.resume and size < len(points):
         raise ConfigError(f"--pbt: expected its {len(points)} points to run in one program, got at most {size} at once")
+    groups = chunks(points, size)
+    plan = Plan(list(command.axes), command.samples, command.optuna, size, points, groups, pbt=command.pbt)
     if command.dry_run:
-        print(plan.tell(command.config))
+        print(plan.describe(config))
         return 0
     run_dir = command.folder
     code = attempt(
         lambda signals: run_sweep(
-            command.config, axes, plan, run_dir, resume=command.resume, overwrite=command.overwrite,
+            config, axes, plan, run_dir, resume=command.resume, overwrite=command.overwrite,
             on_cluster=bool(command.cluster), quiet=command.quiet, shard=shard, signals=signals,
             checkpoint_seconds=command.checkpoint_seconds,
         ),
@@ -89,11 +87,7 @@ def execute(command: Command) -> int:
 
 
 def _check(command: Command) -> list[Axis]:
-    """Return the axes.
-
-    Raises:
-      ConfigError: one is not valid, or stands twice, or there is none; or two strategies are asked for.
-    """
+    """Return the axes; refuse none, one that stands twice, two strategies, and what population-based training bars."""
     if not command.axes:
         raise ConfigError(f"--axes: expected at least one FIELD=VALUES, such as {EXAMPLE}=1e-4,1e-3")
     axes = [parse_axis(text) for text in command.axes]
@@ -112,11 +106,7 @@ def _check(command: Command) -> list[Axis]:
 
 
 def _check_population(command: Command, names: list[str]) -> None:
-    """Check that points of these axes may take over each other's policies.
-
-    Raises:
-      ConfigError: they may not, or there is but one device's part of them.
-    """
+    """Refuse axes whose points cannot take over each other's policies, and points that are not in one program."""
     for name in names:
         if not (is_leaf(name) and name.startswith("train.")):
             raise ConfigError(f"--pbt: {name}: expected numbers of stage train that one program can vary, as {EXAMPLE}")

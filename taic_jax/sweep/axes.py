@@ -1,19 +1,22 @@
-"""Axes of a sweep: which fields take which values, the points they span, and which points fit into one program."""
+"""Axes of a sweep: fields and their values, the points they span, and which points fit into one program."""
 
 import dataclasses
 import itertools
 import math
 import random
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any, get_type_hints
 
 from taic_jax.config import Config, ConfigError, replace, walk
 from taic_jax.config_io import from_text, nearest
 from taic_jax.validation import validate
 
-RANGE, LOGARITHMIC = "..", ":log"
-STATIC_FLOATS = ("env.",)
+RANGE = ".."
+STATIC_FLOATS = "env."
 """Fields that a program is built from although they are numbers: environments are made outside of it."""
+
+Point = dict[str, Any]
+"""Values by the dotted names of their fields."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,22 +55,20 @@ def parse_axis(text: str) -> Axis:
       ConfigError: there is no such field, a value is not of its type, or the interval is empty.
     """
     name, equals, values = text.partition("=")
-    kinds = dict(_kinds(Config))
-    name = name.strip().replace("-", "_")
+    kinds, name = _kinds(Config), name.strip().replace("-", "_")
     if name not in kinds or not equals:
-        what = f"unknown field {name!r}" if equals else f"expected FIELD=VALUES, got {text!r}"
-        raise ConfigError(f"--axes: {what}{nearest(name, kinds)}")
+        problem = f"unknown field {name!r}" if equals else f"expected FIELD=VALUES, got {text!r}"
+        raise ConfigError(f"--axes: {problem}{nearest(name, kinds)}")
     if name in ("seed", "seeds"):
         raise ConfigError(f"--axes: {name}: every point runs the same seeds; give them by --seed and --seeds")
+    if not values:
+        raise ConfigError(f"--axes: {name}: expected values with commas between, got none")
     if RANGE not in values:
-        parts = values.split(",") if values else []
-        if not parts:
-            raise ConfigError(f"--axes: {name}: expected values with commas between, got none")
-        return Axis(name, tuple(from_text(f"--axes: {name}", kinds[name], part.strip()) for part in parts))
+        return Axis(name, tuple(from_text(f"--axes: {name}", kinds[name], x.strip()) for x in values.split(",")))
     if not is_leaf(name):
         raise ConfigError(f"--axes: {name}: an interval is for numbers that one program can vary, got {values!r}")
     interval, _, scale = values.partition(":")
-    low, high = (from_text(f"--axes: {name}", float, part.strip()) for part in interval.split(RANGE, 1))
+    low, high = (from_text(f"--axes: {name}", float, x.strip()) for x in interval.split(RANGE, 1))
     if scale not in ("", "log") or not low < high or (scale and low <= 0):
         expected = "LOW..HIGH, or LOW..HIGH:log with 0 < LOW < HIGH"
         raise ConfigError(f"--axes: {name}: expected {expected}, got {values!r}")
@@ -79,12 +80,8 @@ def is_leaf(name: str) -> bool:
     return type(dict(walk(Config()))[name]) is float and not name.startswith(STATIC_FLOATS)
 
 
-def grid(axes: Sequence[Axis]) -> list[dict[str, Any]]:
-    """Return every combination of the axes' values.
-
-    Raises:
-      ConfigError: an axis is an interval.
-    """
+def grid(axes: Sequence[Axis]) -> list[Point]:
+    """Return every combination of the axes' values; refuse an interval, which has no list of them."""
     for axis in axes:
         if axis.is_range:
             raise ConfigError(f"--axes: {axis.name}: an interval needs --samples or --optuna; a grid takes values")
@@ -92,13 +89,13 @@ def grid(axes: Sequence[Axis]) -> list[dict[str, Any]]:
     return [dict(zip(names, values, strict=True)) for values in itertools.product(*(axis.values for axis in axes))]
 
 
-def sample(axes: Sequence[Axis], count: int, seed: int) -> list[dict[str, Any]]:
+def sample(axes: Sequence[Axis], count: int, seed: int) -> list[Point]:
     """Return random points."""
     generator = random.Random(seed)
     return [{axis.name: axis.draw(generator) for axis in axes} for _ in range(count)]
 
 
-def configs_of(config: Config, points: Sequence[dict[str, Any]]) -> list[Config]:
+def configs_of(config: Config, points: Sequence[Point]) -> list[Config]:
     """Return the config of each point.
 
     Raises:
@@ -106,36 +103,35 @@ def configs_of(config: Config, points: Sequence[dict[str, Any]]) -> list[Config]
     """
     result = []
     for point in points:
-        changed = config
+        result.append(config)
         for name, value in point.items():
-            changed = replace(changed, name, value)
+            result[-1] = replace(result[-1], name, value)
         try:
-            validate(changed)
+            validate(result[-1])
         except ConfigError as error:
             raise ConfigError(f"--axes: point {show(point)}: {error}") from None
-        result.append(changed)
     return result
 
 
-def chunks(points: Sequence[dict[str, Any]], size: int) -> list[list[int]]:
+def chunks(points: Sequence[Point], size: int) -> list[list[int]]:
     """Cut points, by their index, into chunks of at most `size` that differ in nothing that sets a program apart."""
     groups: dict[str, list[int]] = {}
     for i, point in enumerate(points):
-        static = {name: value for name, value in point.items() if not is_leaf(name)}
-        groups.setdefault(repr(sorted(static.items())), []).append(i)
+        static = sorted((name, value) for name, value in point.items() if not is_leaf(name))
+        groups.setdefault(repr(static), []).append(i)
     return [group[i : i + size] for group in groups.values() for i in range(0, len(group), size)]
 
 
-def show(point: dict[str, Any]) -> str:
+def show(point: Point) -> str:
     """Return a point in one line."""
-    return " ".join(
-        f"{name}={value:g}" if isinstance(value, float) else f"{name}={value}" for name, value in point.items()
-    )
+    texts = {name: f"{value:g}" if isinstance(value, float) else value for name, value in point.items()}
+    return " ".join(f"{name}={text}" for name, text in texts.items())
 
 
-def _kinds(cls: type, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for name, kind in get_type_hints(cls).items():
-        if dataclasses.is_dataclass(kind):
-            yield from _kinds(kind, f"{prefix}{name}.")  # type: ignore[arg-type]
-        else:
-            yield prefix + name, kind
+def _kinds(group: type, prefix: str = "") -> dict[str, Any]:
+    """Return the types of all fields by their dotted names."""
+    kinds: dict[str, Any] = {}
+    for name, kind in get_type_hints(group).items():
+        nested = isinstance(kind, type) and dataclasses.is_dataclass(kind)
+        kinds |= _kinds(kind, f"{prefix}{name}.") if nested else {prefix + name: kind}
+    return kinds

@@ -7,20 +7,17 @@ from typing import Any
 import numpy as np
 
 from taic_jax.runtime.files import whole_file
-from taic_jax.sweep.axes import Axis
+from taic_jax.sweep.axes import Axis, Point
 
 
-def draw_marginals(
-    path: Path, axes: Sequence[Axis], points: Sequence[dict[str, Any]], scores: Mapping[int, float]
-) -> None:
+def draw_marginals(path: Path, axes: Sequence[Axis], points: Sequence[Point], scores: Mapping[int, float]) -> None:
     """Draw one panel per axis: a dot per point, and the median of each value where there are few."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(3.2 * len(axes), 3.0), layout="constrained")
     panels = figure.subplots(1, len(axes), sharey=True, squeeze=False)[0]
     for panel, axis in zip(panels, axes, strict=True):
-        values = [points[i][axis.name] for i in scores]
-        _draw(panel, axis, values, np.array(list(scores.values()), float))
+        _draw(panel, axis, [points[i][axis.name] for i in scores], np.array(list(scores.values()), float))
         panel.set_xlabel(axis.name)
     panels[0].set_ylabel("return, interquartile mean")
     with whole_file(path) as file:
@@ -32,8 +29,8 @@ def _draw(panel: Any, axis: Axis, values: list[Any], scores: np.ndarray) -> None
     x: Any = np.array(values if numeric else [str(value) for value in values])
     panel.plot(x, scores, "o", color="0.4", markersize=4)
     if not axis.is_range:
-        named = [value if numeric else str(value) for value in axis.values]
-        tried = [value for value in named if np.isfinite(scores[x == value]).any()]
+        candidates = [value if numeric else str(value) for value in axis.values]
+        tried = [value for value in candidates if np.isfinite(scores[x == value]).any()]
         panel.plot(tried, [np.nanmedian(scores[x == value]) for value in tried], "-", color="C0")
     if numeric and x.min() > 0 and (axis.logarithmic or x.max() / x.min() >= 10):
         panel.set_xscale("log")

@@ -1,6 +1,5 @@
 """How many points of a sweep fit into memory at once: measured on the programs for one row."""
 
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +23,7 @@ def points_that_fit(config: Config, memory: int) -> int:
     Raises:
       ConfigError: not even one does.
     """
-    limit = (memory or machine_memory() // 2) * MIB
-    used = psutil.Process().memory_info().rss
+    limit, used = (memory or machine_memory() // 2) * MIB, psutil.Process().memory_info().rss
     _, source = make_envs(config)
     least = 2 * experience_bytes(source, kept_ticks(config.collect)) * config.seeds if needs_collect(config) else 0
     if used + least < limit:
@@ -65,15 +63,11 @@ def _step_bytes(rows: Config, env: Any, stage: str, keys: jax.Array) -> int:
 
 
 def _experience(config: Config, env: Any) -> list[Experience]:
-    """Return the shapes of what options are learnt from, one row of each source."""
+    """Return the shapes of the experience that options are learnt from, one row of each source."""
     ppo = config.collect.ppo
     ticks = min(num_blocks(config.collect) * ppo.rollout_length, config.collect.ticks // ppo.num_envs)
-    shape = partial(jax.ShapeDtypeStruct, dtype=jnp.float32)
-    base = (1, ticks, ppo.num_envs)
-    one = Experience(
-        shape((*base, env.proprioceptive_size)), shape((*base, env.action_size)), shape(base),
-        jax.ShapeDtypeStruct(base, bool),
-    )  # fmt: skip
+    shapes = [(1, ticks, ppo.num_envs, *last) for last in ([env.proprioceptive_size], [env.action_size], [], [])]
+    one = Experience(*map(jax.ShapeDtypeStruct, shapes, [jnp.float32] * 3 + [jnp.bool]))
     return [one] * max(len(config.options.experience), 1)
 
 

@@ -1,11 +1,10 @@
-"""Points that Optuna asks for, with its journal on disk."""
+"""Points that Optuna suggests, with its journal on disk."""
 
 import math
 from pathlib import Path
-from typing import Any
 
 from taic_jax.envs.errors import MissingExtraError
-from taic_jax.sweep.axes import Axis
+from taic_jax.sweep.axes import Axis, Point
 
 try:
     import optuna
@@ -18,12 +17,9 @@ JOURNAL = "optuna.log"
 
 
 class Study:
-    """Ask for points and tell how they did, the higher the better.
+    """Suggest points along the axes from the results of earlier ones, the higher the better.
 
-    Args:
-      axes: where points lie.
-      run_dir: folder of the journal; a study that is in it goes on.
-      seed: of the sampler.
+    The journal is in `run_dir`; a study that is in it goes on. `seed` is the sampler's.
     """
 
     def __init__(self, axes: list[Axis], run_dir: Path, seed: int):
@@ -36,14 +32,14 @@ class Study:
         }
         self._values = {axis.name: {str(value): value for value in axis.values} for axis in axes if not axis.is_range}
         storage = optuna.storages.JournalStorage(JournalFileBackend(str(run_dir / JOURNAL)))
-        # A point of a batch is asked for before the others' results are known: the liar keeps them apart.
+        # The points of a batch are suggested before any of them has a result: the liar keeps them apart.
         sampler = optuna.samplers.TPESampler(seed=seed, constant_liar=True)
         self._study = optuna.create_study(
             storage=storage, study_name="sweep", direction="maximize", sampler=sampler, load_if_exists=True
         )
 
-    def ask(self, count: int) -> tuple[list[int], list[dict[str, Any]]]:
-        """Return the numbers of so many trials, and their points."""
+    def ask(self, count: int) -> tuple[list[int], list[Point]]:
+        """Return the numbers of so many new trials, and their points."""
         trials = [self._study.ask(self._space) for _ in range(count)]
         points = [
             {name: self._values.get(name, {}).get(value, value) for name, value in trial.params.items()}
@@ -52,10 +48,6 @@ class Study:
         return [trial.number for trial in trials], points
 
     def tell(self, trial: int, value: float) -> None:
-        """Tell how a trial did, unless that was told before; what diverged failed."""
-        if self._study.trials[trial].state.is_finished():
-            return
-        if math.isfinite(value):
-            self._study.tell(trial, value)
-        else:
-            self._study.tell(trial, state=optuna.trial.TrialState.FAIL)
+        """Report the result of a trial, unless it was reported before; one that is not finite failed."""
+        failed = None if math.isfinite(value) else optuna.trial.TrialState.FAIL
+        self._study.tell(trial, None if failed else value, failed, skip_if_finished=True)

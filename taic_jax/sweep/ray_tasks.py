@@ -20,12 +20,9 @@ except ImportError:
     raise MissingExtraError("ray", "cluster") from None
 
 LOCAL = "local"
-PATIENCE = 15.0
-"""Seconds in which a cluster must answer."""
-RETRIES = 100
-"""How many nodes a task may lose."""
-RELEASE = 60.0
-"""Seconds that a task waits for the process of a lost node to let go of the folder."""
+PATIENCE = 15.0  # seconds in which a cluster must answer
+RETRIES = 100  # nodes that a task may lose
+RELEASE = 60.0  # seconds that a task waits for the process of a lost node to let go of the folder
 _PROBE = "import ray, sys; ray.init(sys.argv[1], logging_level='ERROR', log_to_driver=False)"
 
 
@@ -35,27 +32,24 @@ def connect(address: str) -> None:
     Raises:
       ConfigError: it does not answer in time, or is of another version.
     """
-    if address != LOCAL:
-        # In a process of its own: Ray waits for longer, and cannot be told to stop waiting.
-        command = [sys.executable, "-c", _PROBE, address]
-        try:
-            probe = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE)
-        except subprocess.TimeoutExpired:
-            raise ConfigError(_unanswered(address, f"in {PATIENCE:.0f} s")) from None
-        if probe.returncode:
-            last = (probe.stderr.strip().splitlines() or [""])[-1]
-            raise ConfigError(_unanswered(address, f"({last})"))
+    if address != LOCAL and (problem := _probe(address)):
+        expected = f"expected the HOST:PORT of a Ray cluster, got no answer of {address} {problem}"
+        raise ConfigError(f"--cluster: {expected}; {LOCAL} starts one here")
     ray.init(address, logging_level=logging.ERROR, namespace="taic_jax")
 
 
-def _unanswered(address: str, how: str) -> str:
-    return (
-        f"--cluster: expected the HOST:PORT of a Ray cluster, got no answer of {address} {how}; {LOCAL} starts one here"
-    )
+def _probe(address: str) -> str | None:
+    """Return why a cluster does not answer, if so; another process tries, as Ray waits longer and cannot be stopped."""
+    command = [sys.executable, "-c", _PROBE, address]
+    try:
+        probe = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE)
+    except subprocess.TimeoutExpired:
+        return f"in {PATIENCE:.0f} s"
+    return f"({(probe.stderr.strip().splitlines() or [''])[-1]})" if probe.returncode else None
 
 
 def run_tasks(work: Callable[..., Any], tasks: Sequence[tuple], signals: Signals | None = None) -> Iterator[Any]:
-    """Yield what `work(*task)` returns for each of the tasks, in the order in which they end.
+    """Yield the result of `work(*task)` for each of the tasks, in the order in which they end.
 
     A task takes a whole node of the smallest kind there is, and runs in this process's folder, which all nodes share.
     """

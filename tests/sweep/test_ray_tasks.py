@@ -11,7 +11,7 @@ import pytest
 ray = pytest.importorskip("ray", reason="Ray is not installed (extra cluster)")
 cluster_utils = pytest.importorskip("ray.cluster_utils")
 
-from taic_jax.sweep import cluster as clusters  # noqa: E402
+from taic_jax.sweep import ray_tasks as clusters  # noqa: E402
 from taic_jax.sweep.__main__ import main  # noqa: E402
 
 TESTS = Path(__file__).parents[1]
