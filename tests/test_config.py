@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 
 from taic_jax import config as config_module
 from taic_jax.config import CONFIG_CLASSES, Config, ConfigError, PPOConfig, walk
-from taic_jax.config_io import closest, load_config, to_yaml
-from taic_jax.validation import BOUNDS, validate
+from taic_jax.config_io import closest, load_config, to_yaml, validate
 
 
 def write(tmp_path: Path, text: str) -> Path:
@@ -195,11 +194,6 @@ def test_impossible_values_name_field_value_and_nearest(name, value, nearest):
     assert message.startswith(f"{name}: expected") and "\n" not in message
     assert repr(value) in message or value == ()
     assert nearest is None or message.endswith(f"the nearest valid value is {nearest}")
-
-
-def test_every_bound_belongs_to_a_field_and_holds_its_default():
-    names = {name for name, _ in walk(Config())}
-    assert BOUNDS.keys() <= names | {name.rpartition(".")[2] for name in names}
 
 
 def test_every_field_has_a_type_that_can_be_checked():

@@ -4,12 +4,11 @@ import dataclasses
 import itertools
 import math
 import random
-from collections.abc import Iterator, Sequence
-from typing import Any, get_type_hints
+from collections.abc import Sequence
+from typing import Any
 
-from taic_jax.config import Config, ConfigError, replace, walk
-from taic_jax.config_io import from_text, nearest
-from taic_jax.validation import validate
+from taic_jax.config import Config, ConfigError, field_types, replace, walk
+from taic_jax.config_io import from_text, nearest, validate
 
 RANGE, LOGARITHMIC = "..", ":log"
 STATIC_FLOATS = ("env.",)
@@ -52,7 +51,7 @@ def parse_axis(text: str) -> Axis:
       ConfigError: there is no such field, a value is not of its type, or the interval is empty.
     """
     name, equals, values = text.partition("=")
-    kinds = dict(_kinds(Config))
+    kinds = field_types()
     name = name.strip().replace("-", "_")
     if name not in kinds or not equals:
         what = f"unknown field {name!r}" if equals else f"expected FIELD=VALUES, got {text!r}"
@@ -131,11 +130,3 @@ def show(point: dict[str, Any]) -> str:
     return " ".join(
         f"{name}={value:g}" if isinstance(value, float) else f"{name}={value}" for name, value in point.items()
     )
-
-
-def _kinds(cls: type, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for name, kind in get_type_hints(cls).items():
-        if dataclasses.is_dataclass(kind):
-            yield from _kinds(kind, f"{prefix}{name}.")  # type: ignore[arg-type]
-        else:
-            yield prefix + name, kind
