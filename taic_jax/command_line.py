@@ -4,7 +4,6 @@ Arguments are parsed and checked before JAX is imported, so that help and mistak
 """
 
 import contextlib
-import dataclasses
 import errno
 import io
 import itertools
@@ -13,7 +12,7 @@ import re
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -21,7 +20,7 @@ from typing import Annotated, Any, TypeVar
 import tyro
 
 from taic_jax import __version__
-from taic_jax.config import Config, ConfigError, Shard, field_types, replace
+from taic_jax.config import Config, ConfigError, Shard, field_types, impossible, replace
 from taic_jax.config_io import as_integer, load_config, mistyped, nearest, preset_names, validate
 from taic_jax.runtime.files import SaveError
 from taic_jax.runtime.signals import DivergedError, Interrupted, Signals
@@ -103,26 +102,20 @@ def tell(work: Callable[[], int | None]) -> int:
         return 0
     except (ValueError, OSError) as error:
         ours = type(error).__module__.partition(".")[0] == "taic_jax"
-        if (
-            not ours and getattr(error, "filename", None) is None
-        ):  # neither our own nor of a file: the program's mistake
+        if not ours and getattr(error, "filename", None) is None:  # of no file either: a mistake of the program
             raise
         return _fail(2, str(error))
 
 
 def attempt(work: Callable[[Signals], object], run_dir: Path) -> int:
-    """Do the work of a run, which a signal may stop, and return the exit code.
-
-    It is 0 at its end; that of EXIT_CODES for a run that was stopped and saved what it had done; 1 for one whose every
-    seed diverged; and 74 for one that could not write.
-    """
+    """Do the work of a run and return its exit code: 0, FAILED if every seed diverged, UNWRITTEN if it could not write,
+    or one of EXIT_CODES if a signal stopped it and all that was done is saved."""
     try:
         with Signals() as signals:
             work(signals)
     except (Interrupted, KeyboardInterrupt) as stop:
-        received = stop.received if isinstance(stop, Interrupted) else signal.SIGINT
-        name = signal.Signals(received).name
-        print(f"taic_jax: stopped by {name}; --resume --run-dir {run_dir} goes on", file=sys.stderr)
+        received = signal.Signals(stop.received if isinstance(stop, Interrupted) else signal.SIGINT)
+        print(f"taic_jax: stopped by {received.name}; --resume --run-dir {run_dir} goes on", file=sys.stderr)
         return EXIT_CODES[received]
     except DivergedError as error:
         return _fail(FAILED, str(error))
@@ -140,11 +133,7 @@ def _fail(code: int, message: str) -> int:
 
 
 def parse(args: Sequence[str], program: str, kind: type[C]) -> C:
-    """Parse and check the arguments; the fields start from the preset or file that they name.
-
-    Raises:
-      ConfigError: an argument, the named preset or file, or a value is not valid.
-    """
+    """Parse and check the arguments over the preset or file that they name; raise `ConfigError` at a mistake."""
 
     def parse_over(source: str) -> C:
         description = f"{kind.__doc__}\n\nPresets: {', '.join(preset_names())}."
@@ -165,20 +154,15 @@ def parse(args: Sequence[str], program: str, kind: type[C]) -> C:
     if source != first:
         command = parse_over(source)
     if not command.checkpoint_seconds >= 0:
-        raise ConfigError(f"--checkpoint-seconds: expected at least 0, got {command.checkpoint_seconds}")
+        raise impossible("--checkpoint-seconds", command.checkpoint_seconds, "at least 0")
     if command.options:
-        config = replace(command.config, "options.source", command.options)
-        command = dataclasses.replace(command, config=config)
+        command = replace(command, "config.options.source", command.options)
     validate(command.config)
     return command
 
 
 def typed(args: Sequence[str], program: str, kind: type[K], description: str | None = None, **settings: Any) -> K:
-    """Parse arguments into `kind`, a dataclass whose fields all have defaults; `settings` are for tyro.
-
-    Raises:
-      ConfigError: one is not valid.
-    """
+    """Parse into `kind`, a dataclass with defaults; raise `ConfigError` at a mistake. `settings` are for tyro."""
     if "-h" in args or "--help" in args:  # alone, or tyro leaves the arguments before it out of the help
         args = ["--help"]
     try:
@@ -191,10 +175,14 @@ def typed(args: Sequence[str], program: str, kind: type[K], description: str | N
 
 
 def _explain(args: Sequence[str], command: type) -> ConfigError:
-    """Find the argument that tyro refused, by parsing each option alone, and name it in one line."""
+    """Return the error for the argument that tyro refused, found by parsing each option alone."""
     types = {name.removeprefix("config."): kind for name, kind in field_types(command).items()}
-    positional = types.pop("source", None) or types.pop("runs", None)
-    for option, values in _options(args):
+    configured = types.pop("source", None)
+    types.pop("runs", None)  # the positional argument of reports
+    starts = [i for i, arg in enumerate(args) if re.match(r"-(?!inf|nan|[\d.])", arg, re.IGNORECASE)]
+    for start, end in itertools.pairwise([*starts, len(args)]):
+        option, equals, value = args[start].partition("=")
+        values = [value] * bool(equals) + list(args[start + 1 : end])
         name = option.lstrip("-").replace("-", "_")
         if name not in types or option.endswith("-"):  # tyro keeps the underscore at the end of lambda_
             return ConfigError(f"unknown option {option}{nearest(name, types, '--') or '; --help lists them'}")
@@ -203,13 +191,5 @@ def _explain(args: Sequence[str], command: type) -> ConfigError:
                 tyro.cli(command, args=[option, *values])
         except SystemExit:
             return mistyped(option, types[name], " ".join(values) or None)
-    expected = "one CONFIG and options" if positional is str else "options"
+    expected = "one CONFIG and options" if configured else "options"
     return ConfigError(f"unexpected argument in {' '.join(args)!r}; expected {expected}, see --help")
-
-
-def _options(args: Sequence[str]) -> Iterator[tuple[str, list[str]]]:
-    """Yield each option with the values that follow it."""
-    starts = [i for i, arg in enumerate(args) if re.match(r"-(?!inf|nan|[\d.])", arg, re.IGNORECASE)]
-    for start, end in itertools.pairwise([*starts, len(args)]):
-        option, equals, value = args[start].partition("=")
-        yield option, [value] * bool(equals) + list(args[start + 1 : end])

@@ -67,27 +67,6 @@ def _read_changes(source: str) -> dict:
     return changes
 
 
-def validate(config: Config) -> None:
-    """Raise `ConfigError` at the first impossible value, naming field, value, expectation and nearest."""
-    types = field_types(bounds=True)
-    for name, value in walk(config):
-        _check_bounds(name, types[name], value)
-    _check_limits(config)
-    options, baselines = config.options, config.train.baselines
-    if options.source and options.experience:
-        raise impossible("options.experience", list(options.experience), "none with options.source")
-    if options.delta_unit == "quantile" and options.delta > 1:
-        raise impossible("options.delta", options.delta, "at most 1, being a quantile", 1.0)
-    if options.delta_unit == "quantile" and options.termination == "predict" and not options.steps:
-        expected = "error with options.steps 0, where no error of P was measured"
-        raise impossible("options.delta_unit", "quantile", expected, "error")
-    if options.since >= options.until:
-        raise impossible("options.since", options.since, f"less than options.until = {options.until}", 0.0)
-    if "transfer" in baselines and not options.source:
-        expected = "with transfer a run with options and a flat policy"
-        raise impossible("train.baselines", "none: add --options RUN", expected)
-
-
 def to_yaml(config: Config) -> str:
     """Write every field of a configuration, so that `load_config` reads the same one back."""
     return yaml.safe_dump(dataclasses.asdict(config), sort_keys=False)
@@ -115,11 +94,7 @@ def mistyped(name: str, kind: Any, value: Any) -> ConfigError:
 
 
 def from_text(name: str, kind: Any, text: str) -> Any:
-    """Read one value of a field from what was typed for it, as strictly as from YAML.
-
-    Raises:
-        ConfigError: it is not of the field's type.
-    """
+    """Read one value of a field from its text, as strictly as from YAML; raise `ConfigError` for another type."""
     try:
         value = text if kind is str or get_origin(kind) is Literal else yaml.load(text, Loader=_Loader)
     except yaml.YAMLError:
@@ -183,16 +158,15 @@ def _override(default: Any, changes: Any, prefix: str = "") -> Any:
     if not isinstance(changes, dict):
         raise ConfigError(f"{prefix[:-1]}: expected a mapping of {', '.join(kinds)}, got {_show(changes)}")
     values = {}
-    for name, value in changes.items():
-        if name not in kinds:
-            fields = [f"{prefix}{kind}" for kind in kinds] + [BASE] * (not prefix)
-            hint = nearest(f"{prefix}{name}", [*fields, *field_types()]) or f"; there are {', '.join(fields)}"
-            raise ConfigError(f"unknown field {prefix}{name}{hint}")
-        old = getattr(default, name)
-        if dataclasses.is_dataclass(old):
-            values[name] = _override(old, value, f"{prefix}{name}.")
-        else:
-            values[name] = _coerce(f"{prefix}{name}", kinds[name], value)
+    for key, value in changes.items():
+        name = f"{prefix}{key}"
+        if key not in kinds:
+            fields = [f"{prefix}{field}" for field in kinds] + [BASE] * (not prefix)
+            hint = nearest(name, [*fields, *field_types()]) or f"; there are {', '.join(fields)}"
+            raise ConfigError(f"unknown field {name}{hint}")
+        old, kind = getattr(default, key), kinds[key]
+        is_group = dataclasses.is_dataclass(kind)
+        values[key] = _override(old, value, f"{name}.") if is_group else _coerce(name, kind, value)
     return dataclasses.replace(default, **values)
 
 
@@ -215,6 +189,27 @@ def _coerce(name: str, kind: Any, value: Any) -> Any:
 def _show(value: Any) -> str:
     text = "nothing" if value is None else repr(value)
     return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def validate(config: Config) -> None:
+    """Raise `ConfigError` at the first impossible value, naming field, value, expectation and nearest."""
+    types = field_types(bounds=True)
+    for name, value in walk(config):
+        _check_bounds(name, types[name], value)
+    _check_limits(config)
+    options, baselines = config.options, config.train.baselines
+    if options.source and options.experience:
+        raise impossible("options.experience", list(options.experience), "none with options.source")
+    if options.delta_unit == "quantile" and options.delta > 1:
+        raise impossible("options.delta", options.delta, "at most 1, being a quantile", 1.0)
+    if options.delta_unit == "quantile" and options.termination == "predict" and not options.steps:
+        expected = "error with options.steps 0, where no error of P was measured"
+        raise impossible("options.delta_unit", "quantile", expected, "error")
+    if options.since >= options.until:
+        raise impossible("options.since", options.since, f"less than options.until = {options.until}", 0.0)
+    if "transfer" in baselines and not options.source:
+        expected = "with transfer a run with options and a flat policy"
+        raise impossible("train.baselines", "none: add --options RUN", expected)
 
 
 def _check_bounds(name: str, kind: Any, value: Any) -> None:

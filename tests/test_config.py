@@ -6,11 +6,13 @@ import math
 from pathlib import Path
 from typing import get_args, get_origin, get_type_hints
 
+import jax
 import pytest
 import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
+import taic_jax.types  # makes config classes trees
 from taic_jax import config as config_module
 from taic_jax.config import CONFIG_CLASSES, Config, ConfigError, PPOConfig, walk
 from taic_jax.config_io import closest, load_config, to_yaml, validate
@@ -183,6 +185,12 @@ IMPOSSIBLE = [
     ("train.ppo.lambda_", 1.5, 1),
     ("train.ppo.log_std_init", 3.0, 2),
     ("seed", 2**31, 2**31 - 1),
+    ("collect.capacity", -1, 0),
+    ("env.change_after", -1, 0),
+    ("train.fine_tune.epochs", -1, 0),
+    ("train.fine_tune.std", 0.0, 1e-6),
+    ("options.delta", 0.0, 1e-6),
+    ("collect.ppo.log_std_reset", -20.5, -20),
 ]
 
 
@@ -194,6 +202,10 @@ def test_impossible_values_name_field_value_and_nearest(name, value, nearest):
     assert message.startswith(f"{name}: expected") and "\n" not in message
     assert repr(value) in message or value == ()
     assert nearest is None or message.endswith(f"the nearest valid value is {nearest}")
+
+
+def test_every_float_is_a_leaf_whatever_its_bounds():
+    assert jax.tree.leaves(Config()) == [value for _, value in walk(Config()) if type(value) is float]
 
 
 def test_every_field_has_a_type_that_can_be_checked():
