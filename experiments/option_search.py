@@ -25,7 +25,7 @@ from taic_jax.analysis.evaluate import evaluate
 from taic_jax.artifacts.experience import gather_experience
 from taic_jax.command_line import tell
 from taic_jax.config import Config, ConfigError, walk
-from taic_jax.config_io import load_config
+from taic_jax.config_io import load_config, validate
 from taic_jax.envs.base import Env
 from taic_jax.options.dataset import Experience
 from taic_jax.options.execution import make_executor
@@ -36,7 +36,6 @@ from taic_jax.rl import ppo
 from taic_jax.summary import commit
 from taic_jax.sweep.axes import configs_of, grid, is_leaf, parse_axis, replace
 from taic_jax.types import as_arrays
-from taic_jax.validation import validate
 
 FIELDS = (
     "task", "point", "seeds", "ticks", "untrained", "return", "mean_option", "duration", "kl_loss",

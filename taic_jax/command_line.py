@@ -1,39 +1,40 @@
-"""What the command lines share: a config by name, its fields as options, and answers in one line.
+"""Share among the command lines: a config by name, its fields as options, and answers in one line.
 
 Arguments are parsed and checked before JAX is imported, so that help and mistakes answer at once.
 """
 
 import contextlib
-import dataclasses
 import errno
 import io
 import itertools
 import os
+import re
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, get_type_hints
+from typing import Annotated, Any, TypeVar
 
 import tyro
 
 from taic_jax import __version__
-from taic_jax.config import Config, ConfigError, Shard, walk
-from taic_jax.config_io import as_integer, load_config, mistyped, nearest, preset_names
+from taic_jax.config import Config, ConfigError, Shard, field_types, impossible, replace
+from taic_jax.config_io import as_integer, load_config, mistyped, nearest, preset_names, validate
 from taic_jax.runtime.files import SaveError
 from taic_jax.runtime.signals import DivergedError, Interrupted, Signals
-from taic_jax.validation import validate
 
 DEFAULT_PRESET = "nav2d"
 FAILED, UNWRITTEN = 1, 74  # 74 is the system's "input/output error"
-EXIT_CODES: dict[int, int] = {signal.SIGINT: 130, signal.SIGTERM: 75}
+EXIT_CODES: dict[int, int] = {signal.SIGINT: 130, signal.SIGTERM: 75}  # 75 is the system's "try again"
+C = TypeVar("C", bound="Command")
+K = TypeVar("K")
 
 
 @dataclass(frozen=True)
 class Command:
-    """What every command takes."""
+    """The options of every command."""
 
     source: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="CONFIG")] = DEFAULT_PRESET
     """Name of a preset, or path of a YAML file; with --resume by default the run's own."""
@@ -74,25 +75,13 @@ def _integer(info: tyro.constructors.PrimitiveTypeInfo) -> tyro.constructors.Pri
         return None
 
     def read(texts: list[str]) -> int:
-        number = as_integer(texts[0])
-        return int(texts[0]) if number is None else number
+        return as_integer(texts[0]) if "e" in texts[0].lower() else int(texts[0])
 
     return tyro.constructors.PrimitiveConstructorSpec(1, "INT", read, lambda x: isinstance(x, int), lambda x: [str(x)])
 
 
-C = TypeVar("C", bound=Command)
-K = TypeVar("K")
-
-
 def answer(args: Sequence[str] | None, program: str, kind: type[C], execute: Callable[[C], int]) -> int:
-    """Run one command and return its exit code: what `execute` returns, or 2 for a mistake of the user.
-
-    Args:
-      args: what was typed; None takes the process's own.
-      program: how it is called.
-      kind: what it takes.
-      execute: does it.
-    """
+    """Parse the arguments, by default the process's own, execute them, and return the exit code: 2 for a mistake."""
     args = sys.argv[1:] if args is None else args
     if "--version" in args:
         return tell(lambda: print(f"taic_jax {__version__}"))
@@ -100,7 +89,7 @@ def answer(args: Sequence[str] | None, program: str, kind: type[C], execute: Cal
 
 
 def tell(work: Callable[[], int | None]) -> int:
-    """Return the exit code of `work`, None being 0, or 2 after one line that tells what mistake the user made."""
+    """Return the exit code of `work`, None being 0, or 2 after one line that names the user's mistake."""
     try:
         code = work() or 0
         sys.stdout.flush()  # at the end of the process a reader that has gone would be an error
@@ -110,79 +99,70 @@ def tell(work: Callable[[], int | None]) -> int:
         return 130
     except BrokenPipeError:  # the reader, such as head, has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
     except (ValueError, OSError) as error:
-        if not _is_mistake(error):
+        ours = type(error).__module__.partition(".")[0] == "taic_jax"
+        if not ours and getattr(error, "filename", None) is None:  # of no file either: a mistake of the program
             raise
-        print("taic_jax: error:", " ".join(str(error).split()), file=sys.stderr)
-        return 2
-    return 0
+        return _fail(2, str(error))
 
 
 def attempt(work: Callable[[Signals], object], run_dir: Path) -> int:
-    """Do the work of a run, which may be told to stop, and return the exit code.
-
-    It is 0 at its end; a run that was told to stop and saved what it had done gives 130 after SIGINT (Ctrl-C) and 75,
-    the system's "try again", after SIGTERM; one whose every seed diverged gives 1; one that could not write gives 74.
-    """
+    """Do the work of a run and return its exit code: 0, FAILED if every seed diverged, UNWRITTEN if it could not write,
+    or one of EXIT_CODES if a signal stopped it and all that was done is saved."""
     try:
         with Signals() as signals:
             work(signals)
     except (Interrupted, KeyboardInterrupt) as stop:
-        received = stop.received if isinstance(stop, Interrupted) else signal.SIGINT
-        name = signal.Signals(received).name
-        print(f"taic_jax: stopped by {name}; --resume --run-dir {run_dir} goes on", file=sys.stderr)
+        received = signal.Signals(stop.received if isinstance(stop, Interrupted) else signal.SIGINT)
+        print(f"taic_jax: stopped by {received.name}; --resume --run-dir {run_dir} goes on", file=sys.stderr)
         return EXIT_CODES[received]
     except DivergedError as error:
-        print(f"taic_jax: error: {error}", file=sys.stderr)
-        return FAILED
+        return _fail(FAILED, str(error))
     except OSError as error:
         if not isinstance(error, SaveError) and error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
             raise
-        told = " ".join(str(error).split())
-        goes_on = f"what was saved is whole: make room, then --resume --run-dir {run_dir} goes on"
-        print(f"taic_jax: error: {told}; {goes_on}", file=sys.stderr)
-        return UNWRITTEN
+        remedy = f"what was saved is whole: make room, then --resume --run-dir {run_dir} goes on"
+        return _fail(UNWRITTEN, f"{error}; {remedy}")
     return 0
 
 
-def parse(args: Sequence[str], program: str, kind: type[C]) -> C:
-    """Parse and check the arguments; the fields start from the preset or file that they name.
+def _fail(code: int, message: str) -> int:
+    print("taic_jax: error:", " ".join(message.split()), file=sys.stderr)
+    return code
 
-    Raises:
-        ConfigError: an argument, the named preset or file, or a value is not valid.
-    """
+
+def parse(args: Sequence[str], program: str, kind: type[C]) -> C:
+    """Parse and check the arguments over the preset or file that they name; raise `ConfigError` at a mistake."""
+
+    def parse_over(source: str) -> C:
+        description = f"{kind.__doc__}\n\nPresets: {', '.join(preset_names())}."
+        return typed(args, program, kind, description, default=kind(source=source, config=load_config(source)))
+
     first = args[0] if args and not args[0].startswith("-") else DEFAULT_PRESET
-    command = _parse_over(args, program, kind, first)
+    command = parse_over(first)
+    source = command.source
     if command.resume and command.overwrite:
         raise ConfigError("--resume and --overwrite: expected at most one of the two")
     if command.resume and command.run_dir is None:
         raise ConfigError("--resume: expected the folder of the run to continue, as in --run-dir DIR")
-    if command.run_dir and command.resume and command.source not in args:
-        own = command.run_dir / "config.yaml"
-        command = _parse_over(args, program, kind, str(own)) if own.is_file() else command
-    elif command.source != first:
-        command = _parse_over(args, program, kind, command.source)
+    if command.run_dir and command.resume and source not in args:
+        from taic_jax.runtime.run_folder import RunFolder  # it imports JAX
+
+        folder = RunFolder(command.run_dir)
+        source = str(folder.config_path) if folder.begun else source
+    if source != first:
+        command = parse_over(source)
     if not command.checkpoint_seconds >= 0:
-        raise ConfigError(f"--checkpoint-seconds: expected at least 0, got {command.checkpoint_seconds}")
+        raise impossible("--checkpoint-seconds", command.checkpoint_seconds, "at least 0")
     if command.options:
-        options = dataclasses.replace(command.config.options, source=command.options)
-        command = dataclasses.replace(command, config=dataclasses.replace(command.config, options=options))
+        command = replace(command, "config.options.source", command.options)
     validate(command.config)
     return command
 
 
-def _parse_over(args: Sequence[str], program: str, kind: type[C], source: str) -> C:
-    default = kind(source=source, config=load_config(source))
-    description = f"{kind.__doc__}\n\nPresets: {', '.join(preset_names())}."
-    return typed(args, program, kind, description, default=default)
-
-
 def typed(args: Sequence[str], program: str, kind: type[K], description: str | None = None, **settings: Any) -> K:
-    """Parse arguments into `kind`, a dataclass whose fields all have defaults; `settings` are for tyro.
-
-    Raises:
-      ConfigError: one is not valid.
-    """
+    """Parse into `kind`, a dataclass with defaults; raise `ConfigError` at a mistake. `settings` are for tyro."""
     if "-h" in args or "--help" in args:  # alone, or tyro leaves the arguments before it out of the help
         args = ["--help"]
     try:
@@ -195,49 +175,21 @@ def typed(args: Sequence[str], program: str, kind: type[K], description: str | N
 
 
 def _explain(args: Sequence[str], command: type) -> ConfigError:
-    """Find the argument that tyro refused, by parsing each option alone, and tell it in one line."""
-    hints = get_type_hints(command)
-    if hints.get("config") is Config:
-        hints |= {name: _kind(name) for name, _ in walk(Config())}
-    known = {name: kind for name, kind in hints.items() if name not in ("source", "config", "runs")}
-    for option, values in _options(args):
+    """Return the error for the argument that tyro refused, found by parsing each option alone."""
+    types = {name.removeprefix("config."): kind for name, kind in field_types(command).items()}
+    configured = types.pop("source", None)
+    types.pop("runs", None)  # the positional argument of reports
+    starts = [i for i, arg in enumerate(args) if re.match(r"-(?!inf|nan|[\d.])", arg, re.IGNORECASE)]
+    for start, end in itertools.pairwise([*starts, len(args)]):
+        option, equals, value = args[start].partition("=")
+        values = [value] * bool(equals) + list(args[start + 1 : end])
         name = option.lstrip("-").replace("-", "_")
-        if name not in known or option.endswith("-"):  # tyro keeps the underscore at the end of lambda_
-            return ConfigError(f"unknown option {option}{nearest(name, known, '--') or '; --help lists them'}")
+        if name not in types or option.endswith("-"):  # tyro keeps the underscore at the end of lambda_
+            return ConfigError(f"unknown option {option}{nearest(name, types, '--') or '; --help lists them'}")
         try:
             with contextlib.redirect_stderr(io.StringIO()), _INTEGERS:
                 tyro.cli(command, args=[option, *values])
         except SystemExit:
-            return mistyped(option, known[name], " ".join(values) or None)
-    expected = "one CONFIG and options" if "source" in hints else "options"
+            return mistyped(option, types[name], " ".join(values) or None)
+    expected = "one CONFIG and options" if configured else "options"
     return ConfigError(f"unexpected argument in {' '.join(args)!r}; expected {expected}, see --help")
-
-
-def _options(args: Sequence[str]) -> Iterator[tuple[str, list[str]]]:
-    """Yield each option with the values that follow it."""
-    starts = [i for i, arg in enumerate(args) if arg.startswith("-") and not _is_number(arg)]
-    for start, end in itertools.pairwise([*starts, len(args)]):
-        option, equals, value = args[start].partition("=")
-        yield option, [value] * bool(equals) + list(args[start + 1 : end])
-
-
-def _kind(name: str) -> Any:
-    """Return the type of the field with this dotted name."""
-    kind: Any = Config
-    for part in name.split("."):
-        kind = get_type_hints(kind)[part]
-    return kind
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
-
-
-def _is_mistake(error: ValueError | OSError) -> bool:
-    """Tell a mistake of the user (our own errors, files that cannot be used) from one of the program."""
-    ours = type(error).__module__.partition(".")[0] == "taic_jax"
-    return ours or (isinstance(error, OSError) and error.filename is not None)

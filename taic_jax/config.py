@@ -5,16 +5,39 @@ static: it sets shapes or code paths. This module imports no JAX, so that the co
 """
 
 import dataclasses
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, Literal
-
-Shard = Literal["auto", "none", "seeds", "envs"]
-"""What is split over devices; no part of an experiment, but known here without JAX."""
+from typing import Annotated, Any, Literal, NamedTuple, get_type_hints
 
 
 class ConfigError(ValueError):
-    """A mistake in a configuration, told in one line."""
+    """A mistake in a configuration, in one line."""
+
+
+def impossible(name: str, value: Any, expected: str, nearest: Any = math.inf) -> ConfigError:
+    """Return the error for an impossible value, with the nearest valid one if there is one."""
+    hint = "" if nearest == math.inf else f"; the nearest valid value is {nearest}"
+    return ConfigError(f"{name}: expected {expected}, got {value}{hint}")
+
+
+class Bounds(NamedTuple):
+    """Closed interval of the numbers that a field may hold."""
+
+    low: float
+    high: float = math.inf
+
+
+USUAL_BOUNDS: dict[Any, Bounds] = {int: Bounds(1), tuple[int, ...]: Bounds(1), float: Bounds(0)}
+"""Bounds of a field that is not annotated with others, by its type."""
+
+TINY = 1e-6
+Natural = Annotated[int, Bounds(0)]
+Positive = Annotated[float, Bounds(TINY)]
+Share = Annotated[float, Bounds(0, 1)]
+LogStd = Annotated[float, Bounds(-20, 2)]
+Shard = Literal["auto", "none", "seeds", "envs"]
+"""What is split over devices; no part of an experiment, but needed without JAX."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +48,7 @@ class EnvConfig:
     """Environment: a task of this package, brax:NAME, playground:NAME, FILE.py:CLASS or MODULE:CLASS."""
     backend: Literal["auto", "mujoco", "mjx", "warp"] = "auto"
     """Physics engine; auto takes mujoco (C, all cores) on CPU and mjx (JAX) elsewhere."""
-    num_threads: int = 0
+    num_threads: Natural = 0
     """Threads of the mujoco backend; 0 takes the physical cores."""
     pipeline: str = "spring"
     """Physics pipeline of the brax:NAME environments."""
@@ -36,7 +59,7 @@ class EnvConfig:
     goal: Literal["fixed", "near", "uniform"] = "fixed"
     """Goal of ant_maze: behind the walls, at the end of the first corridor, or drawn in each episode of training and
     behind the walls in evaluation."""
-    change_after: int = 0
+    change_after: Natural = 0
     """Episodes of each environment after which the room of nav2d changes; 0 for never."""
 
 
@@ -58,23 +81,23 @@ class PPOConfig:
     """Step size of Adam."""
     learning_rate_decay: bool = True
     """Let the step size fall linearly to zero over the stage."""
-    gamma: float = 0.99
+    gamma: Share = 0.99
     """Discount per tick."""
-    lambda_: float = 0.95
+    lambda_: Share = 0.95
     """Decay of the advantage estimate per decision."""
-    clip: float = 0.2
+    clip: Positive = 0.2
     """Half-width of the interval that clips the probability ratio."""
     value_weight: float = 0.5
     """Weight of the critic's loss."""
     entropy_weight: float = 0.0
     """Weight of the entropy bonus."""
-    max_grad_norm: float = 0.5
+    max_grad_norm: Positive = 0.5
     """Global norm at which gradients are clipped."""
-    log_std_init: float = -0.916
+    log_std_init: LogStd = -0.916
     """Initial log standard deviation of the policy; exp(-0.916) = 0.4."""
     reset_at_change: bool = False
     """Set it to log_std_reset where the task changes (env.change_after), once half of the environments have."""
-    log_std_reset: float = 0.0
+    log_std_reset: LogStd = 0.0
     """Log standard deviation from which exploration starts anew there."""
     normalize_advantage: bool = True
     """Standardise the advantages of each minibatch."""
@@ -90,7 +113,7 @@ class CollectConfig:
     """Environment to collect in; empty takes env.name."""
     ticks: int = 1_000_000
     """Budget of interactions per seed."""
-    capacity: int = 0
+    capacity: Natural = 0
     """Newest ticks of experience that are kept, per seed; 0 keeps all."""
     ppo: PPOConfig = PPOConfig()
 
@@ -121,11 +144,11 @@ class OptionsConfig:
     """Fewest ticks of the windows that termination output learns from."""
     end_signal: Literal["sampled", "threshold"] = "sampled"
     """How termination output reads D's end signal: as a probability, or as yes above one half."""
-    delta: float = 0.5
+    delta: Positive = 0.5
     """Threshold on P's error at which termination predict ends an option (Algorithm 1)."""
     delta_unit: Literal["error", "quantile"] = "quantile"
     """What delta counts: P's error itself, or the share of held-out predictions whose error is smaller."""
-    steps: int = 2000
+    steps: Natural = 2000
     """Gradient steps; 0 leaves the option model as random as it was drawn."""
     batch_size: int = 128
     """Windows per gradient step."""
@@ -141,17 +164,17 @@ class OptionsConfig:
     """Weight of L_pred, which makes the code's effect predictable."""
     lambda_end: float = 0.1
     """Weight of the end signal's cross-entropy under termination output."""
-    max_grad_norm: float = 1.0
+    max_grad_norm: Positive = 1.0
     """Global norm at which gradients are clipped."""
-    since: float = 0.0
+    since: Share = 0.0
     """Share of the experience before the first window."""
-    until: float = 1.0
+    until: Share = 1.0
     """Share of the experience before the last window."""
     parts: int = 1
     """Equal parts of that span, of each of which select takes its share: 3 mixes early, middle and late."""
     select: Literal["random", "top"] = "top"
     """Which of these windows to learn from: all, or those that collected most reward."""
-    fraction: float = 0.5
+    fraction: Annotated[float, Bounds(TINY, 1)] = 0.5
     """Share of the windows that select top keeps."""
     views: Literal["one", "all"] = "one"
     """See each window as it was, or as from any of the body's equal sides: the ant has four."""
@@ -164,13 +187,13 @@ class OptionsConfig:
 class FineTuneConfig:
     """Fine-tuning of D by PPO on its actions, in turns with the policy over options; off unless epochs is set."""
 
-    epochs: int = 0
+    epochs: Natural = 0
     """Passes over the ticks of each iteration that update D; 0 leaves D as it was learnt."""
     minibatch_size: int = 512
     """Ticks per gradient step of D."""
     learning_rate: float = 5e-4
     """Step size of Adam for D; it decays as that of the policy does."""
-    std: float = 0.2
+    std: Positive = 0.2
     """Standard deviation of the noise on D's actions while training."""
     kl_weight: float = 0.0
     """Weight of the divergence from the D that was learnt."""
@@ -195,7 +218,7 @@ class EvaluateConfig:
 
     episodes: int = 10
     """Episodes per seed."""
-    video_ticks: int = 200
+    video_ticks: Natural = 200
     """Ticks in the video; 0 makes none."""
 
 
@@ -208,7 +231,7 @@ class Config:
     options: OptionsConfig = OptionsConfig()
     train: TrainConfig = TrainConfig()
     evaluate: EvaluateConfig = EvaluateConfig()
-    seed: int = 0
+    seed: Annotated[int, Bounds(0, 2**31 - 1)] = 0
     """Seed of the PRNG key that everything random comes from."""
     seeds: int = 1
     """Independent repeats, trained side by side in one program."""
@@ -231,7 +254,7 @@ METHOD_LABELS = {
 """The methods of a summary in words: options, and the flat baselines by their names in `train.baselines`."""
 
 
-def kept_ticks(config: CollectConfig) -> int:
+def experience_ticks(config: CollectConfig) -> int:
     """Return how many ticks of experience stage collect leaves, per seed, but for the rest of an iteration."""
     return min(config.capacity or config.ticks, config.ticks)
 
@@ -255,6 +278,15 @@ def walk(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
             yield from walk(value, f"{prefix}{field.name}.")
         else:
             yield prefix + field.name, value
+
+
+def field_types(group: Any = Config, prefix: str = "", *, bounds: bool = False) -> dict[str, Any]:
+    """Return the types of these fields by dotted name, Annotated by their `Bounds` on request."""
+    types = {}
+    for name, kind in get_type_hints(group, include_extras=bounds).items():
+        is_group = dataclasses.is_dataclass(kind)
+        types |= field_types(kind, f"{prefix}{name}.", bounds=bounds) if is_group else {prefix + name: kind}
+    return types
 
 
 def replace(config: Any, name: str, value: Any) -> Any:

@@ -1,17 +1,20 @@
-"""Configurations from YAML and back: a preset or file holds only its differences from the defaults or its base."""
+"""Configurations from YAML and back, and their checks; a file holds its differences from the defaults or its base."""
 
 import contextlib
 import dataclasses
 import difflib
+import math
 from collections.abc import Iterable
 from importlib import resources
+from operator import ge, le
 from pathlib import Path
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 import yaml
 
-from taic_jax.config import Config, ConfigError, walk
+from taic_jax.config import USUAL_BOUNDS, Config, ConfigError, field_types, impossible, walk
 
+_PRESETS = resources.files("taic_jax.experiments") / "presets"
 BASE = "base"
 """Key of a file that names what it starts from, a preset or another file; without it, the defaults."""
 SYNONYMS = {
@@ -25,17 +28,13 @@ SYNONYMS = {
 """Words of other libraries for a field."""
 
 
-def load_config(source: str | Path) -> Config:
-    """Load a preset by its name, or a YAML file by its path.
+def load_config(source: str | Path, above: tuple[str, ...] = ()) -> Config:
+    """Load a preset by its name, or a YAML file by its path; the files `above` start from it.
 
     Raises:
         ConfigError: it or its base is missing, is not YAML, or holds an unknown field or a mistyped value.
     """
-    return _load(str(source), ())
-
-
-def _load(source: str, above: tuple[str, ...]) -> Config:
-    """Load what the files `above` start from, the last of them at once."""
+    source = str(source)
     if source in above:
         raise ConfigError(f"{above[0]}: base: expected an end, got {' -> '.join((*above, source))}")
     try:
@@ -47,7 +46,7 @@ def _load(source: str, above: tuple[str, ...]) -> Config:
         base = changes.pop(BASE)
         if not isinstance(base, str):
             raise ConfigError(f"{source}: base: expected a preset's name or a file, got {_show(base)}")
-        config = _load(base, (*above, source))
+        config = load_config(base, (*above, source))
     try:
         return _override(config, changes)
     except ConfigError as error:
@@ -75,32 +74,27 @@ def to_yaml(config: Config) -> str:
 
 def preset_names() -> list[str]:
     """List the presets that ship with the package."""
-    return sorted(file.name.removesuffix(".yaml") for file in _presets().iterdir() if file.name.endswith(".yaml"))
+    return sorted(file.name.removesuffix(".yaml") for file in _PRESETS.iterdir() if file.name.endswith(".yaml"))
 
 
 def mistyped(name: str, kind: Any, value: Any) -> ConfigError:
     """Return the error for a value of the wrong type, with the nearest valid value where there is one."""
-    item = get_args(kind)[0] if get_origin(kind) is tuple else kind
+    many = get_origin(kind) is tuple
+    item = get_args(kind)[0] if many else kind
+    nouns = {int: ("an integer", "integers"), float: ("a number", "numbers"), str: ("text", "texts")}
+    expected = nouns.get(item, ("a value", "values"))[many]
     choices = get_args(item) if get_origin(item) is Literal else ("True", "False") if item is bool else ()
-    if item is kind:
-        nouns = {int: "an integer", float: "a number", str: "text"}
-        expected = f"one of {', '.join(choices)}" if choices else nouns.get(kind, "a value")
-    else:
-        plurals = {int: "integers", str: "texts"}
-        expected = "a list of " + (f"some of {', '.join(choices)}" if choices else plurals.get(item, "values"))
+    if choices:
+        expected = f"{'some' if many else 'one'} of {', '.join(choices)}"
     hint = nearest(str(value), choices)
     if kind is int:
         with contextlib.suppress(ValueError, TypeError, OverflowError):
             hint = f"; the nearest is {round(float(value))}"
-    return ConfigError(f"{name}: expected {expected}, got {_show(value)}{hint}")
+    return ConfigError(f"{name}: expected {'a list of ' * many}{expected}, got {_show(value)}{hint}")
 
 
 def from_text(name: str, kind: Any, text: str) -> Any:
-    """Read one value of a field from what was typed for it, as strictly as from YAML.
-
-    Raises:
-        ConfigError: it is not of the field's type.
-    """
+    """Read one value of a field from its text, as strictly as from YAML; raise `ConfigError` for another type."""
     try:
         value = text if kind is str or get_origin(kind) is Literal else yaml.load(text, Loader=_Loader)
     except yaml.YAMLError:
@@ -112,20 +106,26 @@ def closest(name: str, names: Iterable[str]) -> str | None:
     """Return the one of the dotted `names` that `name` stands for: by a word that other libraries use, by its end, or
     by its looks; None where none is like it."""
     names, (group, _, end) = list(names), name.rpartition(".")
-    if end in SYNONYMS:
-        meant = SYNONYMS[end]
-        candidates = [f"{group}.{meant.rpartition('.')[2]}", meant]
-        if known := [candidate for candidate in candidates if candidate in names]:
-            return known[0]
-    same_end = [known for known in names if known.rpartition(".")[2] == end]
-    found = difflib.get_close_matches(name, same_end or names, n=1, cutoff=0.0 if same_end else 0.6)
-    return found[0] if found else None
+    synonym = SYNONYMS.get(end, name)
+    for candidate in (f"{group}.{synonym.rpartition('.')[2]}", synonym):
+        if candidate in names:
+            return candidate
+    same_end = [other for other in names if other.rpartition(".")[2] == end]
+    matches = difflib.get_close_matches(name, same_end or names, n=1, cutoff=0.0 if same_end else 0.6)
+    return matches[0] if matches else None
 
 
 def nearest(name: str, names: Iterable[str], prefix: str = "") -> str:
     """Return `; the nearest is ...` for the end of a message, empty where nothing is near."""
-    found = closest(name, names)
-    return f"; the nearest is {prefix}{found}" if found else ""
+    match = closest(name, names)
+    return f"; the nearest is {prefix}{match}" if match else ""
+
+
+def as_integer(value: float | str) -> int:
+    """Return the integer that is written as a float or with an exponent, 1e6 say, or raise ValueError."""
+    if not float(value).is_integer():
+        raise ValueError(f"{value} is no integer")
+    return int(float(value))
 
 
 class _Loader(yaml.SafeLoader):
@@ -139,16 +139,12 @@ class _Loader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
-def _presets() -> Any:
-    return resources.files("taic_jax.experiments") / "presets"
-
-
 def _read_text(source: str) -> str:
     if not source.endswith((".yaml", ".yml")) and "/" not in source:
         if source not in preset_names():
             hint = nearest(source, preset_names()) or f"; there are {', '.join(preset_names())}"
             raise ConfigError(f"unknown preset {source!r}{hint} (a file's name ends in .yaml)")
-        return (_presets() / f"{source}.yaml").read_text()
+        return (_PRESETS / f"{source}.yaml").read_text()
     try:
         return Path(source).read_text()
     except (OSError, UnicodeDecodeError) as error:
@@ -162,49 +158,87 @@ def _override(default: Any, changes: Any, prefix: str = "") -> Any:
     if not isinstance(changes, dict):
         raise ConfigError(f"{prefix[:-1]}: expected a mapping of {', '.join(kinds)}, got {_show(changes)}")
     values = {}
-    for name, value in changes.items():
-        if name not in kinds:
-            groups = [f"{prefix}{kind}" for kind in kinds] + [BASE] * (not prefix)
-            hint = nearest(f"{prefix}{name}", groups + [known for known, _ in walk(Config())])
-            hint = hint or f"; there are {', '.join(groups)}"
-            raise ConfigError(f"unknown field {prefix}{name}{hint}")
-        old = getattr(default, name)
-        if dataclasses.is_dataclass(old):
-            values[name] = _override(old, value, f"{prefix}{name}.")
-        else:
-            values[name] = _coerce(f"{prefix}{name}", kinds[name], value)
+    for key, value in changes.items():
+        name = f"{prefix}{key}"
+        if key not in kinds:
+            fields = [f"{prefix}{field}" for field in kinds] + [BASE] * (not prefix)
+            hint = nearest(name, [*fields, *field_types()]) or f"; there are {', '.join(fields)}"
+            raise ConfigError(f"unknown field {name}{hint}")
+        old, kind = getattr(default, key), kinds[key]
+        is_group = dataclasses.is_dataclass(kind)
+        values[key] = _override(old, value, f"{name}.") if is_group else _coerce(name, kind, value)
     return dataclasses.replace(default, **values)
 
 
 def _coerce(name: str, kind: Any, value: Any) -> Any:
     """Check a YAML value strictly; but integers and 1e-3, a text in YAML 1.1, are floats, and 1e6 is an integer."""
-    if kind is float and isinstance(value, int | str) and not isinstance(value, bool):
-        try:
-            return float(value)
-        except ValueError:
-            pass
-    elif kind is int and isinstance(value, float | str):
-        if (number := as_integer(value)) is not None:
-            return number
-    elif get_origin(kind) is tuple and isinstance(value, list):
-        try:
+    try:
+        if get_origin(kind) is tuple and isinstance(value, list):
             return tuple(_coerce(name, get_args(kind)[0], item) for item in value)
-        except ConfigError:
-            raise mistyped(name, kind, value) from None
-    elif value in get_args(kind) if get_origin(kind) is Literal else type(value) is kind:
+        if kind is float and isinstance(value, int | str) and not isinstance(value, bool):
+            return float(value)
+        if kind is int and (isinstance(value, float) or (isinstance(value, str) and "e" in value.lower())):
+            return as_integer(value)
+    except (ValueError, OverflowError):
+        raise mistyped(name, kind, value) from None
+    if value in get_args(kind) if get_origin(kind) is Literal else type(value) is kind:
         return value
     raise mistyped(name, kind, value)
-
-
-def as_integer(value: float | str) -> int | None:
-    """Return the integer that is written as a float or with an exponent, 1e6 say, or None if it is none."""
-    if isinstance(value, str) and "e" not in value.lower():
-        return None
-    with contextlib.suppress(ValueError):
-        return int(float(value)) if float(value).is_integer() else None
-    return None
 
 
 def _show(value: Any) -> str:
     text = "nothing" if value is None else repr(value)
     return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def validate(config: Config) -> None:
+    """Raise `ConfigError` at the first impossible value, naming field, value, expectation and nearest."""
+    types = field_types(bounds=True)
+    for name, value in walk(config):
+        _check_bounds(name, types[name], value)
+    _check_limits(config)
+    options, baselines = config.options, config.train.baselines
+    if options.source and options.experience:
+        raise impossible("options.experience", list(options.experience), "none with options.source")
+    if options.delta_unit == "quantile" and options.delta > 1:
+        raise impossible("options.delta", options.delta, "at most 1, being a quantile", 1.0)
+    if options.delta_unit == "quantile" and options.termination == "predict" and not options.steps:
+        expected = "error with options.steps 0, where no error of P was measured"
+        raise impossible("options.delta_unit", "quantile", expected, "error")
+    if options.since >= options.until:
+        raise impossible("options.since", options.since, f"less than options.until = {options.until}", 0.0)
+    if "transfer" in baselines and not options.source:
+        expected = "with transfer a run with options and a flat policy"
+        raise impossible("train.baselines", "none: add --options RUN", expected)
+
+
+def _check_bounds(name: str, kind: Any, value: Any) -> None:
+    if kind == tuple[int, ...] and not value:
+        raise impossible(name, "none", "at least one size", 64)
+    bounds = get_args(kind)[1] if get_origin(kind) is Annotated else USUAL_BOUNDS.get(kind)
+    for number in value if isinstance(value, tuple) else (value,):
+        if bounds and not (math.isfinite(number) and bounds.low <= number <= bounds.high):
+            interval = f"at least {bounds.low}" if bounds.high == math.inf else f"in [{bounds.low}, {bounds.high}]"
+            nearest_valid = bounds.high if number >= bounds.low else bounds.low
+            raise impossible(name, value, f"a finite number {interval}", nearest_valid)
+
+
+def _check_limits(config: Config) -> None:
+    """Check the fields whose least or largest value is that of other fields, or a product of them."""
+    values, baselines = dict(walk(config)), config.train.baselines
+    collected = "collect.ppo.num_envs * collect.ppo.rollout_length"  # flat PPO is configured by collect.ppo
+    trained = "train.ppo.num_envs * train.ppo.rollout_length"
+    for applies, name, allowed, expected, other in (
+        (True, "collect.ppo.minibatch_size", le, "at most", collected),
+        (True, "collect.ticks", ge, "at least one iteration,", collected),
+        (True, "train.ppo.minibatch_size", le, "at most", trained),
+        (config.train.fine_tune.epochs, "train.fine_tune.minibatch_size", le, "at most", trained),
+        (True, "train.ticks", ge, "at least one iteration,", trained),
+        (True, "options.length", le, "at most", "train.ppo.rollout_length"),
+        (True, "options.shortest", le, "at most", "options.length"),
+        ("repeat" in baselines, "options.length", le, "with baseline repeat at most", "collect.ppo.rollout_length"),
+        (baselines, "train.ticks", ge, "at least an iteration of baselines,", collected),
+    ):
+        limit = math.prod(values[factor] for factor in other.split(" * "))
+        if applies and not allowed(values[name], limit):
+            raise impossible(name, values[name], f"{expected} {other} = {limit}", limit)

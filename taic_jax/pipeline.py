@@ -20,7 +20,7 @@ from taic_jax.config import (
     ConfigError,
     Shard,
     collector_is_baseline,
-    kept_ticks,
+    experience_ticks,
     needs_collect,
 )
 from taic_jax.envs import environment_options, make_env
@@ -244,8 +244,8 @@ def _without_stopped(results: Any, stopped: np.ndarray) -> Any:
 def collect(run: Run, env: Env) -> Trained:
     """Train flat PPO, keep its trajectories as experience, and save the policy as the artifact `policy`."""
     config = run.config.collect
-    if kept_ticks(config) < config.ticks:
-        run.logger.say(f"collect: of {config.ticks:,} ticks the newest {kept_ticks(config):,} are kept")
+    if experience_ticks(config) < config.ticks:
+        run.logger.say(f"collect: of {config.ticks:,} ticks the newest {experience_ticks(config):,} are kept")
     store = ExperienceStore(run.dir / EXPERIENCE, num_blocks(config), describe(env) | {"seeds": len(run.keys)})
     trained = _train(run, env, "collect", after=store.write)
     save_policy(run.dir / POLICY, trained.agent, env)

@@ -10,7 +10,7 @@ import tyro
 
 from taic_jax import command_line
 from taic_jax.command_line import FAILED, answer, attempt
-from taic_jax.config import ConfigError
+from taic_jax.config import ConfigError, impossible
 from taic_jax.config_io import to_yaml
 from taic_jax.runtime.signals import Signals
 
@@ -37,31 +37,26 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 def parse(args: Sequence[str]) -> Command:
-    """Parse and check the arguments.
-
-    Raises:
-      ConfigError: an argument, the named preset or file, or a value is not valid.
-    """
+    """Parse and check the arguments, as `command_line.parse` does."""
     return command_line.parse(args, PROGRAM, Command)
 
 
 def _check_hosts(command: Command) -> None:
-    if command.hosts < 1:
-        raise ConfigError(f"--hosts: expected at least 1, got {command.hosts}; the nearest valid value is 1")
-    last = command.hosts - 1
-    if not 0 <= command.host <= last:
-        nearest = min(max(command.host, 0), last)
-        raise ConfigError(f"--host: expected 0 to {last}, got {command.host}; the nearest valid value is {nearest}")
-    if command.hosts == 1:
+    hosts, host, last = command.hosts, command.host, command.hosts - 1
+    if hosts < 1:
+        raise impossible("--hosts", hosts, "at least 1", 1)
+    if not 0 <= host <= last:
+        raise impossible("--host", host, f"0 to {last}", min(max(host, 0), last))
+    if hosts == 1:
         return
     if command.run_dir is None:
         raise ConfigError("--hosts: expected --run-dir DIR too, a folder that every host sees")
-    host, _, port = command.coordinator.rpartition(":")
-    if not host or not port.isdigit() or not 1 <= int(port) <= 65535:
-        told = f"expected HOST:PORT of the first host, with a port from 1 to 65535, got {command.coordinator!r}"
-        raise ConfigError(f"--coordinator: {told}")
+    address, _, port = command.coordinator.rpartition(":")
+    if not address or not port.isdigit() or not 1 <= int(port) <= 65535:
+        expected = "HOST:PORT of the first host, with a port from 1 to 65535"
+        raise impossible("--coordinator", repr(command.coordinator), expected)
     if command.shard == "none":
-        raise ConfigError("--shard: expected what to split over the hosts, seeds or envs, got none")
+        raise impossible("--shard", "none", "what to split over the hosts, seeds or envs")
 
 
 def execute(command: Command) -> int:
@@ -70,15 +65,16 @@ def execute(command: Command) -> int:
     if command.replay:
         from taic_jax.replay import replay
 
-        found = replay(command.replay)
-        print(found or f"{command.replay}: all numbers were finite this time")
-        return 0 if found else FAILED
+        report = replay(command.replay)
+        print(report or f"{command.replay}: all numbers were finite this time")
+        return 0 if report else FAILED
     from rich.console import Console
 
     from taic_jax.pipeline import check_run, run_pipeline
     from taic_jax.runtime.devices import open_devices
     from taic_jax.runtime.hosts import Hosts
     from taic_jax.runtime.program_cache import keep_programs
+    from taic_jax.runtime.run_folder import RunFolder
     from taic_jax.summary import as_table, plan
 
     if command.dry_run:
@@ -100,7 +96,7 @@ def execute(command: Command) -> int:
             Console().print(as_table(summary))
             print(f"compare and look at runs:  python -m taic_jax.report {run_dir}")
             print(f"curves (extra viz):        tensorboard --logdir {run_dir}")
-        print(run_dir / "summary.json")
+        print(RunFolder(run_dir).summary_path)
 
     return attempt(work, run_dir)
 

@@ -14,7 +14,7 @@ from rich.table import Table
 from taic_jax.analysis.evaluate import record
 from taic_jax.analysis.statistics import iqm, summarize
 from taic_jax.artifacts.experience import experience_bytes
-from taic_jax.config import COLLECT, METHOD_LABELS, Config, collector_is_baseline, kept_ticks, needs_collect
+from taic_jax.config import COLLECT, METHOD_LABELS, Config, collector_is_baseline, experience_ticks, needs_collect
 from taic_jax.envs.base import Env
 from taic_jax.nonfinite import FINITE, QUANTITIES
 from taic_jax.rl.ppo import Agent, num_iterations
@@ -46,9 +46,9 @@ def plan(config: Config, env: Env, source: Env) -> str:
         learn = f"{'learn':8} {options.steps:,} gradient steps on windows of {options.length} ticks from {names}"
     lines.insert(1 if collects else 0, learn)
     if collects:
-        size = experience_bytes(source, kept_ticks(collect)) * config.seeds / MIB
-        if kept_ticks(collect) < collect.ticks:
-            lines.append(f"{'keep':8} the newest {kept_ticks(collect):,} ticks of collect")
+        size = experience_bytes(source, experience_ticks(collect)) * config.seeds / MIB
+        if experience_ticks(collect) < collect.ticks:
+            lines.append(f"{'keep':8} the newest {experience_ticks(collect):,} ticks of collect")
         memory = "" if options.source else f", {2 * size:,.0f} MiB while options are learnt"
         lines.append(f"{'memory':8} experience {size:,.0f} MiB on disk{memory}")
     return "\n".join(lines)

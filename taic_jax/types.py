@@ -7,7 +7,7 @@ Axes, used in every docstring of the package:
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_type_hints
 
 import jax
 import jax.numpy as jnp
@@ -22,9 +22,9 @@ Scalar = Float[Array, ""] | float
 
 def _register(cls: type) -> None:
     """Make a config class a pytree: floats and nested configs are children, all else is static."""
-    fields = dataclasses.fields(cls)
-    leaves = [f.name for f in fields if f.type is float or dataclasses.is_dataclass(f.type)]
-    static = [f.name for f in fields if f.name not in leaves]
+    kinds = get_type_hints(cls)  # without their bounds
+    leaves = [name for name, kind in kinds.items() if kind is float or dataclasses.is_dataclass(kind)]
+    static = [name for name in kinds if name not in leaves]
     jax.tree_util.register_dataclass(cls, data_fields=leaves, meta_fields=static)
 
 

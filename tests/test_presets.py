@@ -9,8 +9,7 @@ from tiny_runs import with_fields
 
 from taic_jax import config as config_module
 from taic_jax.config import Config, ConfigError, walk
-from taic_jax.config_io import load_config, preset_names, to_yaml
-from taic_jax.validation import validate
+from taic_jax.config_io import load_config, preset_names, to_yaml, validate
 
 
 def write(tmp_path: Path, text: str) -> Path:

@@ -16,7 +16,7 @@ from jaxtyping import Array, Key
 
 from taic_jax.artifacts.demonstrations import read_demonstrations
 from taic_jax.artifacts.models import DESCRIPTION, Body, read_description
-from taic_jax.config import CollectConfig, kept_ticks
+from taic_jax.config import CollectConfig, experience_ticks
 from taic_jax.envs.base import Env
 from taic_jax.options.dataset import Experience
 from taic_jax.options.execution import IdentityExecutor
@@ -71,7 +71,7 @@ def _iteration(
 
 def num_blocks(config: CollectConfig) -> int:
     """Return how many iterations' worth of experience is kept, at least one."""
-    return max(kept_ticks(config) // (config.ppo.num_envs * config.ppo.rollout_length), 1)
+    return max(experience_ticks(config) // (config.ppo.num_envs * config.ppo.rollout_length), 1)
 
 
 def experience_bytes(env: Env, ticks: int) -> int:

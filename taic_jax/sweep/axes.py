@@ -5,11 +5,10 @@ import itertools
 import math
 import random
 from collections.abc import Sequence
-from typing import Any, get_type_hints
+from typing import Any
 
-from taic_jax.config import Config, ConfigError, replace, walk
-from taic_jax.config_io import from_text, nearest
-from taic_jax.validation import validate
+from taic_jax.config import Config, ConfigError, field_types, replace, walk
+from taic_jax.config_io import from_text, nearest, validate
 
 RANGE = ".."
 STATIC_FLOATS = "env."
@@ -55,7 +54,7 @@ def parse_axis(text: str) -> Axis:
       ConfigError: there is no such field, a value is not of its type, or the interval is empty.
     """
     name, equals, values = text.partition("=")
-    kinds, name = _kinds(Config), name.strip().replace("-", "_")
+    kinds, name = field_types(), name.strip().replace("-", "_")
     if name not in kinds or not equals:
         problem = f"unknown field {name!r}" if equals else f"expected FIELD=VALUES, got {text!r}"
         raise ConfigError(f"--axes: {problem}{nearest(name, kinds)}")
@@ -126,12 +125,3 @@ def show(point: Point) -> str:
     """Return a point in one line."""
     texts = {name: f"{value:g}" if isinstance(value, float) else value for name, value in point.items()}
     return " ".join(f"{name}={text}" for name, text in texts.items())
-
-
-def _kinds(group: type, prefix: str = "") -> dict[str, Any]:
-    """Return the types of all fields by their dotted names."""
-    kinds: dict[str, Any] = {}
-    for name, kind in get_type_hints(group).items():
-        nested = isinstance(kind, type) and dataclasses.is_dataclass(kind)
-        kinds |= _kinds(kind, f"{prefix}{name}.") if nested else {prefix + name: kind}
-    return kinds

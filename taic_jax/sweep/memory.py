@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import psutil
 
 from taic_jax.artifacts.experience import experience_bytes, num_blocks
-from taic_jax.config import Config, ConfigError, kept_ticks, needs_collect
+from taic_jax.config import Config, ConfigError, experience_ticks, needs_collect
 from taic_jax.options.dataset import Experience, make_dataset
 from taic_jax.pipeline import make_envs
 from taic_jax.trainer import init_rows, make_trainer, step_rows
@@ -25,7 +25,8 @@ def points_that_fit(config: Config, memory: int) -> int:
     """
     limit, used = (memory or machine_memory() // 2) * MIB, psutil.Process().memory_info().rss
     _, source = make_envs(config)
-    least = 2 * experience_bytes(source, kept_ticks(config.collect)) * config.seeds if needs_collect(config) else 0
+    ticks = experience_ticks(config.collect) if needs_collect(config) else 0
+    least = 2 * experience_bytes(source, ticks) * config.seeds
     if used + least < limit:
         count = int((limit - used) / (row_bytes(config) * config.seeds))
         if count:

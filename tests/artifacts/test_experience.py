@@ -10,7 +10,7 @@ from probes import Counting, assert_trees_equal
 
 from taic_jax.artifacts.experience import ExperienceStore, collect, gather_experience, num_blocks, read_experience
 from taic_jax.artifacts.models import describe
-from taic_jax.config import CollectConfig, PPOConfig, kept_ticks
+from taic_jax.config import CollectConfig, PPOConfig, experience_ticks
 from taic_jax.envs import make_env
 from taic_jax.options.dataset import Experience
 from taic_jax.runtime.checkpoint import ArtifactError
@@ -143,7 +143,7 @@ def test_all_ticks_are_kept_but_where_the_capacity_is_smaller():
     ppo = PPOConfig(num_envs=2, rollout_length=4)
     blocks = {capacity: num_blocks(CollectConfig(ticks=5 * 8, capacity=capacity, ppo=ppo)) for capacity in (0, 16, 99)}
     assert blocks == {0: 5, 16: 2, 99: 5}
-    assert CollectConfig().capacity == 0 and kept_ticks(CollectConfig(ticks=3_000_000)) == 3_000_000
+    assert CollectConfig().capacity == 0 and experience_ticks(CollectConfig(ticks=3_000_000)) == 3_000_000
 
 
 def test_description_is_json(tmp_path):
