@@ -21,6 +21,7 @@ from taic_jax.config import (
     Shard,
     collector_is_baseline,
     experience_ticks,
+    impossible,
     needs_collect,
 )
 from taic_jax.envs import environment_options, make_env
@@ -142,25 +143,17 @@ def make_envs(config: Config) -> tuple[Env, Env]:
         raise ConfigError(f"{field}: {error}") from None
     bodies = [(*describe(e).values(),)[1:] for e in (source, env)]
     if bodies[0] != bodies[1]:
-        raise ConfigError(
-            f"collect.env: expected the body of {config.env.name} (proprioceptive slice, its size, and action size "
-            f"{bodies[1]}), got {config.collect.env} with {bodies[0]}"
-        )
+        expected = f"the body of {config.env.name} (proprioceptive slice, its size, and action size {bodies[1]})"
+        raise impossible("collect.env", f"{config.collect.env} with {bodies[0]}", expected)
     if config.train.ppo.reset_at_change and "changed" not in jax.eval_shape(env.reset, jax.random.key(0)).metrics:
-        raise ConfigError(
-            f"train.ppo.reset_at_change: expected a task that changes, as nav2d does with env.change_after, "
-            f"got {config.env.name}, which never does; the nearest valid value is False"
-        )
+        expected = "a task that changes, as nav2d does with env.change_after"
+        raise impossible("train.ppo.reset_at_change", f"{config.env.name}, which never does", expected, False)
     if config.options.views == "all" and len(source.views) == 1 and not config.options.source:
-        raise ConfigError(
-            f"options.views: expected a body with several equal sides, as ant has, got all with {source.name}, "
-            "which has one; the nearest valid value is one"
-        )
-    if config.options.length > env.episode_length:
-        raise ConfigError(
-            f"options.length: expected at most the {env.episode_length} ticks of an episode of {env.name}, "
-            f"got {config.options.length}; the nearest valid value is {env.episode_length}"
-        )
+        expected = "a body with several equal sides, as ant has"
+        raise impossible("options.views", f"all with {source.name}, which has one", expected, "one")
+    if config.options.length > (longest := env.episode_length):
+        expected = f"at most the {longest} ticks of an episode of {env.name}"
+        raise impossible("options.length", config.options.length, expected, longest)
     return env, source
 
 
