@@ -32,30 +32,23 @@ class Command:
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code: 0, or 2 for a mistake in what was asked."""
-    return tell(lambda: execute(parse(sys.argv[1:] if args is None else args)))
-
-
-def parse(args: Sequence[str]) -> Command:
-    """Parse and check the arguments.
-
-    Raises:
-      ConfigError: one is not valid.
-    """
-    command = typed(args, PROGRAM, Command)
-    if not command.runs:
-        raise ConfigError("RUNS: expected at least one folder of a run, got none")
-    for name, least in (("points", 2), ("options", 0)):
-        if getattr(command, name) < least:
-            raise ConfigError(f"--{name}: expected at least {least}, got {getattr(command, name)}")
-    return command
+    return tell(lambda: execute(typed(sys.argv[1:] if args is None else args, PROGRAM, Command)))
 
 
 def execute(command: Command) -> int:
-    """Write the page and print its path."""
+    """Write the page and print its path.
+
+    Raises:
+      ConfigError: an argument is not valid.
+    """
+    if not command.runs:
+        raise ConfigError("RUNS: expected at least one folder of a run, got none")
+    for name, value, least in (("points", command.points, 2), ("options", command.options, 0)):
+        if value < least:
+            raise ConfigError(f"--{name}: expected at least {least}, got {value}")
     from taic_jax.report.page import Detail, write_report
 
-    detail = Detail(command.points, command.options, not command.no_videos)
-    write_report(command.runs, command.out, detail)
+    write_report(command.runs, command.out, Detail(command.points, command.options, not command.no_videos))
     print(command.out)
     return 0
 

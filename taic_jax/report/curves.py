@@ -1,13 +1,13 @@
 """Curves of a run: every metric of every stage over interactions, per seed and over seeds."""
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from taic_jax.analysis.statistics import bootstrap_interval, iqm
 from taic_jax.config import COLLECT, METHOD_LABELS
-from taic_jax.report.runs import LoadedRun, ReportError, per_seed, read_run
+from taic_jax.report.runs import LoadedRun, ReportError, per_seed, read_run, run_of
+from taic_jax.runtime.files import json_safe
 
 DIGITS = 5
 """Significant digits of what is drawn."""
@@ -22,23 +22,17 @@ def label_of(run: LoadedRun, stage: str) -> str:
 
 
 def stage_curves(run: LoadedRun, stage: str, points: int) -> dict[str, Any]:
-    """Return all curves of one stage, ready for JSON.
-
-    Args:
-      run: of which.
-      stage: of which.
-      points: at most so many iterations are kept, evenly spaced, the first and the last among them.
-    """
+    """Return all curves of one stage, ready for JSON: at most so many iterations, as `thinned` chooses."""
     rows = run.of_stage(stage)
-    kept = [rows[i] for i in thinned(len(rows), points)]
-    unit = "ticks" if "ticks" in kept[0] else "steps"
-    names = sorted({name for row in kept for name in row if name.startswith(f"{stage}/")})
-    metrics = {name.partition("/")[2]: _over_seeds([per_seed(row, name) for row in kept], run) for name in names}
-    ticks, missing = pretraining(run, stage)
+    drawn = [rows[i] for i in thinned(len(rows), points)]
+    unit = "ticks" if "ticks" in drawn[0] else "steps"
+    names = sorted({name for row in drawn for name in row if name.startswith(f"{stage}/")})
+    curves = {name.partition("/")[2]: _over_seeds([per_seed(row, name) for row in drawn]) for name in names}
+    ticks, uncounted = pretraining(run, stage)
     return {
         "stage": stage, "label": label_of(run, stage), "task": run.task_of(stage), "unit": unit,
-        "iterations": len(rows), "x": [row[unit] for row in kept], "pretraining": ticks, "uncounted": missing,
-        "metrics": {name: curve for name, curve in metrics.items() if curve is not None},
+        "iterations": len(rows), "x": [row[unit] for row in drawn], "pretraining": ticks, "uncounted": uncounted,
+        "metrics": {name: curve for name, curve in curves.items() if curve is not None},
     }  # fmt: skip
 
 
@@ -50,12 +44,8 @@ def thinned(count: int, points: int) -> list[int]:
 def pretraining(run: LoadedRun, stage: str, above: tuple[str, ...] = ()) -> tuple[int, list[str]]:
     """Return the interactions per seed spent before a stage on what it builds on, and what could not be counted.
 
-    Options build on the experience they were learnt from; baseline `transfer` on the source run's policy.
-
-    Args:
-      run: of which.
-      stage: of which.
-      above: names of the runs that led here, none of which is counted again.
+    Options build on the experience they were learnt from; baseline `transfer` on the source run's policy. Names of
+    the runs that led here are `above`, and none of these is counted again.
     """
     source = str(run.fields.get("options.source") or "")
     if stage == "transfer":
@@ -64,18 +54,15 @@ def pretraining(run: LoadedRun, stage: str, above: tuple[str, ...] = ()) -> tupl
         return 0, []
     if source:
         return _spent_in(source, "train", above)
-    total, missing = 0, []
-    for name in run.fields.get("options.experience") or [COLLECT]:
-        ticks, unknown = (run.ticks(COLLECT), []) if name == COLLECT else _spent_in(str(name), COLLECT, above)
-        total, missing = total + ticks, missing + unknown
-    return total, missing
+    experience = [str(name) for name in run.fields.get("options.experience") or [COLLECT]]
+    spent = [(run.ticks(name), []) if name == COLLECT else _spent_in(name, COLLECT, above) for name in experience]
+    return sum(ticks for ticks, _ in spent), [name for _, names in spent for name in names]
 
 
 def _spent_in(name: str, stage: str, above: tuple[str, ...]) -> tuple[int, list[str]]:
-    """Return the ticks another run spent in stage collect, or before stage train; its name if that is not known."""
-    path = Path(name)
+    """Return the ticks another run spent in stage collect, or before stage train; its name if they cannot be read."""
     try:
-        other = read_run(path if (path / "config.yaml").is_file() else path.parent)
+        other = read_run(run_of(name).path)
     except ReportError:
         return 0, [name]
     if stage == "train" and name not in above:
@@ -83,30 +70,21 @@ def _spent_in(name: str, stage: str, above: tuple[str, ...]) -> tuple[int, list[
     return (other.ticks(COLLECT), []) if stage == COLLECT and other.of_stage(COLLECT) else (0, [name])
 
 
-def _over_seeds(values: list[np.ndarray | None], run: LoadedRun) -> dict[str, Any] | None:
+def _over_seeds(values: list[np.ndarray | None]) -> dict[str, Any] | None:
     """Return every seed's curve, the interquartile mean and its 95 % interval; None where nothing is a number.
 
     As in the summary, there are no statistics over the other seeds where one has no number.
     """
     width = max((len(value) for value in values if value is not None), default=0)
-    if not width:
-        return None
     table = np.array([np.full(width, np.nan) if value is None else value for value in values])
     if not np.isfinite(table).any():
         return None
     low, high = np.array([_interval(row) for row in table]).T
-    curve = {"iqm": iqm(table), "low": low, "high": high}
-    return {name: rounded(x) for name, x in curve.items()} | {"seeds": [rounded(seed) for seed in table.T]}
+    return json_safe({"iqm": iqm(table), "low": low, "high": high, "seeds": table.T}, DIGITS)
 
 
 def _interval(values: np.ndarray) -> tuple[float, float]:
-    if not np.isfinite(values).all():
-        return float("nan"), float("nan")
-    if len(values) > 1 and (values == values[0]).all():  # what does not vary, and there is much of it
-        return float(values[0]), float(values[0])
+    """Return the bootstrap interval, at once where the values do not vary, as those of many metrics."""
+    if len(values) > 1 and (values == values[0]).all():
+        return values[0], values[0]
     return bootstrap_interval(values)
-
-
-def rounded(values: np.ndarray, digits: int = DIGITS) -> list[float | None]:
-    """Return numbers to so many significant digits, for JSON; what is not finite becomes None."""
-    return [float(f"{x:.{digits}g}") if np.isfinite(x) else None for x in values]

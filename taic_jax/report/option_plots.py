@@ -13,12 +13,11 @@ from taic_jax.analysis.option_space import encode_windows
 from taic_jax.artifacts.experience import gather_experience
 from taic_jax.artifacts.models import OPTIONS, Body, described_body, load_options
 from taic_jax.config import COLLECT, ConfigError, OptionsConfig
-from taic_jax.config_io import load_config
 from taic_jax.options.dataset import Experience
 from taic_jax.options.model import OptionModel
-from taic_jax.report.curves import rounded
-from taic_jax.report.runs import LoadedRun
+from taic_jax.report.runs import LoadedRun, run_of
 from taic_jax.runtime.checkpoint import ArtifactError
+from taic_jax.runtime.files import json_safe
 from taic_jax.types import as_arrays
 
 
@@ -27,12 +26,10 @@ def option_plot(run: LoadedRun, count: int) -> dict[str, Any]:
 
     The options are the means of q(o|a) over windows drawn from what the model was learnt from, coloured by the change
     of state these windows recorded. Without that experience they are drawn from the prior, coloured by the change
-    that P predicts from the mean state.
-
-    Args:
-      run: whose options; it may have them from another run.
-      count: how many options, N.
+    that P predicts from the mean state. With a count of 0 the picture is left out.
     """
+    if not count:
+        return {"missing": "left out by --options 0"}
     if run.config is None:
         return {"missing": "the config is of another version"}
     if run.point:
@@ -48,32 +45,35 @@ def option_plot(run: LoadedRun, count: int) -> dict[str, Any]:
     except ArtifactError as error:
         return {"missing": str(error)}
     model = jax.tree.map(lambda x: x[0], models)
-    experience, why = _experience(home, config, body)
+    try:
+        experience, why = _experience(home, config, body), ""
+    except (ArtifactError, OSError) as error:
+        experience, why = None, f"what they were learnt from is not there: {error}"
     if experience:
-        option, change = _encoded(config, model, experience, count)
+        codes, drawn = _encoded(config, model, experience, count), "windows"
     else:
-        option, change = _drawn(config, model, body, count)
-    return _picture(option, change) | {"drawn": "windows" if experience else "prior", "why": why, "folder": str(folder)}
+        codes, drawn = _from_prior(config, model, count), "prior"
+    return _picture(*codes) | {"drawn": drawn, "why": why}
 
 
 def _learnt_in(folder: Path, config: OptionsConfig) -> tuple[Path, OptionsConfig]:
     """Return the run whose experience the options of a run were learnt from, and how they were."""
     if not config.source:
         return folder, config
-    source = Path(config.source)
-    source = source if (source / "config.yaml").is_file() else source.parent
+    home = run_of(config.source)
     with contextlib.suppress(ConfigError):
-        return source, load_config(source / "config.yaml").options
-    return source, config
+        config = home.config().options
+    return home.path, config
 
 
-def _experience(folder: Path, config: OptionsConfig, body: Body) -> tuple[list[Experience], str]:
-    """Return the first seed's experience that options were learnt from, or none and why."""
+def _experience(folder: Path, config: OptionsConfig, body: Body) -> list[Experience]:
+    """Return the first seed's experience that options were learnt from.
+
+    Raises:
+      ArtifactError, OSError: it is not there.
+    """
     sources = [folder if name == COLLECT else Path(name) for name in config.experience or (COLLECT,)]
-    try:
-        return [jax.tree.map(lambda x: x[0], gather_experience(source, body, 1)) for source in sources], ""
-    except (ArtifactError, OSError) as error:
-        return [], f"what they were learnt from is not there: {error}"
+    return [jax.tree.map(lambda x: x[0], gather_experience(source, body, 1)) for source in sources]
 
 
 def _encoded(
@@ -85,7 +85,7 @@ def _encoded(
     return windows.mean, windows.end - windows.start
 
 
-def _drawn(config: OptionsConfig, model: OptionModel, body: Body, count: int) -> tuple[np.ndarray, np.ndarray]:
+def _from_prior(config: OptionsConfig, model: OptionModel, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Return codes [N, D] drawn from the prior and the changes [N, P] that P predicts from the mean state."""
     option = jax.random.normal(jax.random.key(0), (count, config.size))
     predict = partial(model.predict, jnp.zeros(model.state_size))
@@ -94,16 +94,11 @@ def _drawn(config: OptionsConfig, model: OptionModel, body: Body, count: int) ->
 
 
 def _picture(option: np.ndarray, change: np.ndarray) -> dict[str, Any]:
-    """Project codes on their principal components, and tell how well these two tell each coordinate's change."""
+    """Project codes on their principal components, and say how well these two tell each coordinate's change."""
     plane, shares = principal_plane(option)
-    return {
-        "size": option.shape[1],
-        "x": rounded(plane[:, 0], 4),
-        "y": rounded(plane[:, 1], 4),
-        "shares": rounded(shares, 3),
-        "changes": [rounded(column, 3) for column in change.T],
-        "r2": rounded(np.array([_r2(plane, column) for column in change.T]), 3),
-    }
+    r2 = [_r2(plane, column) for column in change.T]
+    picture = json_safe({"shares": shares, "changes": change.T, "r2": r2}, 3)
+    return picture | {"size": option.shape[1], **json_safe({"x": plane[:, 0], "y": plane[:, 1]}, 4)}
 
 
 def principal_plane(option: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -115,8 +110,8 @@ def principal_plane(option: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     _, scales, axes = np.linalg.svd(centred, full_matrices=False)
     axes = axes * np.sign(axes[np.arange(len(axes)), np.abs(axes).argmax(axis=1)])[:, None]
     plane, shares = centred @ axes[:2].T, scales**2 / max((scales**2).sum(), np.finfo(float).tiny)
-    missing = 2 - plane.shape[1]
-    return np.pad(plane, ((0, 0), (0, max(missing, 0)))), np.pad(shares[:2], (0, max(missing, 0)))
+    missing = max(2 - plane.shape[1], 0)
+    return np.pad(plane, ((0, 0), (0, missing))), np.pad(shares[:2], (0, missing))
 
 
 def _r2(plane: np.ndarray, change: np.ndarray) -> float:

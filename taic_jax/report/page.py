@@ -10,38 +10,26 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+from taic_jax.config import Config, walk
 from taic_jax.report.curves import stage_curves
 from taic_jax.report.option_plots import option_plot
 from taic_jax.report.results import facts_of, histograms_of, methods_of
-from taic_jax.report.runs import (
-    UNTRAINED_STAGES,
-    LoadedRun,
-    ReportError,
-    check_seeds,
-    default_fields,
-    read_run,
-    unique_names,
-)
-from taic_jax.report.sweeps import SweepData, is_sweep, read_sweep
+from taic_jax.report.runs import LoadedRun, ReportError, check_seeds, read_run, unique_names
+from taic_jax.report.sweeps import read_sweep
 from taic_jax.runtime.files import save_text
+from taic_jax.sweep.runs import PLAN
 
-SCRIPTS = ("page.js", "charts.js", "scatter.js", "tables.js", "sections.js")
+SCRIPTS = ("page.js", "charts.js", "curves.js", "scatter.js", "tables.js", "sections.js")
 GENERATOR = '<meta name="generator" content="taic_jax.report">'
 
 
 @dataclasses.dataclass(frozen=True)
 class Detail:
-    """How much of the runs a page holds.
+    """How much of the runs a page holds."""
 
-    Attributes:
-      points: of a curve at most.
-      options: in the picture of an option space; 0 leaves these pictures out.
-      videos: whether they are embedded.
-    """
-
-    points: int = 300
-    options: int = 1000
-    videos: bool = True
+    points: int = 300  # of a curve at most
+    options: int = 1000  # in the picture of an option space; 0 leaves these pictures out
+    videos: bool = True  # whether they are embedded
 
 
 def write_report(folders: Sequence[Path], out: Path, detail: Detail = Detail()) -> None:
@@ -62,13 +50,22 @@ def write_report(folders: Sequence[Path], out: Path, detail: Detail = Detail()) 
 
 
 def collect(folders: Sequence[Path], detail: Detail = Detail()) -> dict[str, Any]:
-    """Return everything a page shows of runs and sweeps, ready for JSON."""
-    runs, sweeps = _read(folders)
+    """Return everything a page shows of runs and sweeps, ready for JSON; a sweep's points are runs."""
+    runs, sweeps = [], []
+    for folder, name in zip(folders, unique_names(folders), strict=True):
+        if (folder / PLAN).is_file():
+            sweep, points = read_sweep(folder, name)
+            sweeps.append(sweep)
+            runs += points
+        else:
+            runs.append(read_run(folder, name))
+    for run in runs:
+        check_seeds(run)
     return {
         "made": time.strftime("%Y-%m-%d %H:%M"),
         "runs": [_collect_run(run, detail) for run in runs],
-        "sweeps": [dataclasses.asdict(sweep) for sweep in sweeps],
-        "defaults": default_fields(),
+        "sweeps": sweeps,
+        "defaults": dict(walk(Config())),
         "notes": _differences(runs),
     }
 
@@ -88,24 +85,9 @@ def render(data: dict[str, Any]) -> str:
     return before + "".join(parts[name] + after for name, _, after in pieces)
 
 
-def _read(folders: Sequence[Path]) -> tuple[list[LoadedRun], list[SweepData]]:
-    """Read every folder, in the order given; a sweep's points are runs."""
-    runs, sweeps = [], []
-    for folder, name in zip(folders, unique_names(folders), strict=True):
-        if is_sweep(folder):
-            sweep, points = read_sweep(folder, name)
-            sweeps.append(sweep)
-            runs += points
-        else:
-            runs.append(read_run(folder, name))
-    for run in runs:
-        check_seeds(run)
-    return runs, sweeps
-
-
 def _collect_run(run: LoadedRun, detail: Detail) -> dict[str, Any]:
-    stages = list(dict.fromkeys(row["stage"] for row in run.rows if row["stage"] not in UNTRAINED_STAGES[:1]))
-    plot = option_plot(run, detail.options) if detail.options else {"missing": "left out by --options 0"}
+    video = run.folder / "video.webp"
+    shows = detail.videos and not run.point and video.is_file()
     return {
         "name": run.name,
         "folder": str(run.folder),
@@ -113,36 +95,26 @@ def _collect_run(run: LoadedRun, detail: Detail) -> dict[str, Any]:
         "notes": list(run.notes),
         "methods": methods_of(run),
         "histograms": histograms_of(run),
-        "stages": [stage_curves(run, stage, detail.points) for stage in stages],
-        "options": plot,
-        "video": _video(run) if detail.videos and not run.point else None,
+        "stages": [stage_curves(run, stage, detail.points) for stage in run.stages()],
+        "options": option_plot(run, detail.options),
+        "video": f"data:image/webp;base64,{base64.b64encode(video.read_bytes()).decode()}" if shows else None,
         "config": run.fields,
     }
 
 
-def _video(run: LoadedRun) -> str | None:
-    """Return the video as a data URI, or None if there is none."""
-    path = run.folder / "video.webp"
-    return "data:image/webp;base64," + base64.b64encode(path.read_bytes()).decode() if path.is_file() else None
-
-
 def _differences(runs: Sequence[LoadedRun]) -> list[str]:
-    """Tell what keeps runs from being compared number by number."""
-    notes = []
-    for what, values in (
-        ("task", [run.task for run in runs]),
-        ("number of seeds", [str(run.seeds) for run in runs]),
-        ("commit", [str(run.summary.get("commit"))[:8] for run in runs if run.summary]),
-        *((f"version of {name}", seen) for name, seen in _versions(runs).items()),
-    ):
-        different = list(dict.fromkeys(values))
-        if len(different) > 1:
-            notes.append(f"the runs differ in {what}: {', '.join(different)}".replace("None", "not recorded"))
-    return notes
-
-
-def _versions(runs: Sequence[LoadedRun]) -> dict[str, list[str]]:
-    """Return for each package the versions the finished runs had."""
-    told = [run.summary.get("versions") or {} for run in runs if run.summary]
-    names = dict.fromkeys(name for versions in told for name in versions)
-    return {name: [str(versions.get(name)) for versions in told if versions] for name in names}
+    """Note what keeps runs from being compared number by number."""
+    finished = [run.summary for run in runs if run.summary]
+    versions = [summary["versions"] for summary in finished if summary.get("versions")]
+    values = {
+        "task": [run.task for run in runs],
+        "number of seeds": [str(run.seeds) for run in runs],
+        "commit": [str(summary.get("commit"))[:8] for summary in finished],
+    }
+    for name in dict.fromkeys(name for of_run in versions for name in of_run):
+        values[f"version of {name}"] = [str(of_run.get(name)) for of_run in versions]
+    different = {what: list(dict.fromkeys(texts)) for what, texts in values.items() if len(set(texts)) > 1}
+    return [
+        f"the runs differ in {what}: {', '.join(texts)}".replace("None", "not recorded")
+        for what, texts in different.items()
+    ]

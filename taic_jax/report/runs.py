@@ -4,19 +4,16 @@ import contextlib
 import dataclasses
 import json
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
 
-from taic_jax.config import COLLECT, Config, ConfigError, walk
-from taic_jax.config_io import closest, load_config
-from taic_jax.runtime.logging import Row
-
-UNTRAINED_STAGES = ("evaluate", "learn")
-"""Stages of metrics.jsonl in which no policy is trained."""
+from taic_jax.config import COLLECT, Config, ConfigError
+from taic_jax.config_io import closest
+from taic_jax.runtime.run_folder import Row, RunFolder
 
 
 class ReportError(ValueError):
@@ -25,29 +22,17 @@ class ReportError(ValueError):
 
 @dataclasses.dataclass(frozen=True)
 class LoadedRun:
-    """One run, or one point of a sweep.
+    """One run, or one point of a sweep."""
 
-    Attributes:
-      name: unique in the report.
-      folder: of the run.
-      fields: dotted name -> value of everything in its config.yaml, as read.
-      config: the same, or None where it is of another version.
-      rows: of metrics.jsonl.
-      summary: None while the run is not finished.
-      clock: ticks and seconds so far.
-      notes: what the reader must know: partial, stopped seeds, lines left out.
-      point: whether it is a point of a sweep.
-    """
-
-    name: str
+    name: str  # unique in the report
     folder: Path
-    fields: dict[str, Any]
-    config: Config | None
+    fields: dict[str, Any]  # everything in config.yaml by its dotted name, as read
+    config: Config | None  # None where it is of another version
     rows: list[Row]
-    summary: dict[str, Any] | None
-    clock: dict[str, Any]
-    notes: tuple[str, ...]
-    point: bool = False
+    summary: dict[str, Any] | None  # None while the run is not finished
+    clock: dict[str, Any]  # ticks and seconds so far
+    notes: tuple[str, ...]  # for the reader: partial, stopped seeds, rows left out
+    point: bool = False  # whether it is a point of a sweep
 
     @property
     def seeds(self) -> int:
@@ -59,24 +44,36 @@ class LoadedRun:
         """The task that is trained on."""
         return str(self.fields["env.name"])
 
+    @property
+    def methods(self) -> dict[str, Any]:
+        """The evaluations of the summary by method; none while the run is not finished."""
+        return (self.summary or {}).get("methods", {})
+
     def of_stage(self, stage: str) -> list[Row]:
         """Return the rows of one stage."""
         return [row for row in self.rows if row["stage"] == stage]
 
     def ticks(self, stage: str) -> int:
-        """Return the interactions per seed made in a stage so far; 0 if it has not begun."""
-        return max((int(row["ticks"]) for row in self.of_stage(stage)), default=0)
+        """Return the interactions per seed (of `learn`, gradient steps) in a stage so far; 0 if it has not begun."""
+        return max((int(row["ticks" if "ticks" in row else "steps"]) for row in self.of_stage(stage)), default=0)
 
     def stages(self) -> list[str]:
+        """Return the stages that have curves, in the order they ran."""
+        return [stage for stage in dict.fromkeys(row["stage"] for row in self.rows) if stage != "evaluate"]
+
+    def trained_stages(self) -> list[str]:
         """Return the stages that trained a policy, in the order they ran."""
-        return [stage for stage in dict.fromkeys(row["stage"] for row in self.rows) if stage not in UNTRAINED_STAGES]
+        return [stage for stage in self.stages() if stage != "learn"]
 
     def task_of(self, stage: str) -> str:
         """Return the task of a stage: experience may be collected in another."""
         return str(self.fields.get("collect.env") or self.task) if stage == COLLECT else self.task
 
     def flat_stage(self) -> str | None:
-        """Return the stage that is baseline `flat`: its own, or stage collect on the same task for as many ticks."""
+        """Return the stage that is baseline `flat`: its own, or else what `config.collector_is_baseline` says.
+
+        That rule is applied to the fields as read, so that it holds for a config of another version too.
+        """
         if self.of_stage("flat"):
             return "flat"
         same = self.fields.get("collect.ticks") == self.fields.get("train.ticks") and self.task_of(COLLECT) == self.task
@@ -89,21 +86,29 @@ def read_run(folder: Path, name: str = "") -> LoadedRun:
     Raises:
       ReportError: it is none, no iteration is finished in it, or its rows are of another run than its config.
     """
-    if not (folder / "config.yaml").is_file():
+    files = RunFolder(folder)
+    if not files.begun:
         raise ReportError(f"{folder}: expected the folder of a run, with config.yaml in it{_nearest(folder)}")
-    fields, config, notes = _read_config(folder / "config.yaml")
-    rows, cut = _read_rows(folder / "metrics.jsonl")
+    fields, config, notes = _read_config(files)
+    rows, cut = _read_rows(files.metrics_path)
     if not rows:
         raise ReportError(f"{folder}: expected at least one finished iteration, got none in metrics.jsonl")
     notes += cut
-    clock = _read_json(folder / "clock.json") or {}
-    summary = _read_json(folder / "summary.json")
+    summary = _json_object(files.summary_path)
     if summary is not None and "methods" not in summary:
-        raise ReportError(f"{folder / 'summary.json'}: expected the summary of a run, with its methods; got another")
-    if summary is None and (folder / "summary.json").exists():
+        raise ReportError(f"{files.summary_path}: expected the summary of a run, with its methods; got another")
+    if summary is None and files.summary_path.exists():
         notes += ("summary.json cannot be read: shown as a run that is not finished",)
-    run = LoadedRun(name or folder.name, folder, fields, config, rows, summary, clock, notes)
+    run = LoadedRun(
+        name or folder.name, folder, fields, config, rows, summary, _json_object(files.clock_path) or {}, notes
+    )
     return dataclasses.replace(run, notes=notes + _state(run) + _stopped(run))
+
+
+def run_of(name: str) -> RunFolder:
+    """Return the folder of the run that a config takes something from: the one it names, or the artifact's there."""
+    files = RunFolder(Path(name))
+    return files if files.begun else RunFolder(files.path.parent)
 
 
 def check_seeds(run: LoadedRun) -> None:
@@ -113,7 +118,7 @@ def check_seeds(run: LoadedRun) -> None:
             if isinstance(value, list) and len(value) != run.seeds:
                 why = "; a sweep's chunk is shown by its sweep's folder" if run.folder.name.startswith("chunk-") else ""
                 raise ReportError(
-                    f"{run.folder / 'metrics.jsonl'}: {name}: expected {run.seeds} seeds as in config.yaml, "
+                    f"{RunFolder(run.folder).metrics_path}: {name}: expected {run.seeds} seeds as in config.yaml, "
                     f"got {len(value)}{why}"
                 )
 
@@ -138,16 +143,18 @@ def unique_names(folders: Sequence[Path]) -> list[str]:
 
 
 def _nearest(folder: Path) -> str:
-    """Tell of a run in or beside a folder that is none."""
+    """Name a run in or beside a folder that is none."""
+    pattern = f"*/{RunFolder(folder).config_path.name}"
     for parent, prefix in ((folder, "holds"), (folder.parent, "the nearest is")):
-        runs = [path.parent.name for path in parent.glob("*/config.yaml")] if parent.is_dir() else []
-        if runs:
-            return f"; {prefix} {parent / (closest(folder.name, runs) or sorted(runs)[0])}"
+        names = sorted(path.parent.name for path in parent.glob(pattern)) if parent.is_dir() else []
+        if names:
+            return f"; {prefix} {parent / (closest(folder.name, names) or names[0])}"
     return ""
 
 
-def _read_config(path: Path) -> tuple[dict[str, Any], Config | None, tuple[str, ...]]:
+def _read_config(files: RunFolder) -> tuple[dict[str, Any], Config | None, tuple[str, ...]]:
     """Return the fields as they are, and the config where it is of this version."""
+    path = files.config_path
     try:
         fields = dict(_flatten(yaml.safe_load(path.read_text())))
     except (yaml.YAMLError, UnicodeDecodeError):
@@ -155,14 +162,14 @@ def _read_config(path: Path) -> tuple[dict[str, Any], Config | None, tuple[str, 
     if "env.name" not in fields or not isinstance(fields.get("seeds"), int):
         raise ReportError(f"{path}: expected the resolved config of a run, got one without env.name or seeds")
     try:
-        return fields, load_config(path), ()
+        return fields, files.config(), ()
     except ConfigError as error:
         return fields, None, (f"config of another version, so its option space is not drawn: {error}",)
 
 
-def _flatten(tree: Any, prefix: str = "") -> Any:
+def _flatten(tree: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
     """Yield (dotted name, value) of every leaf of nested mappings."""
-    for name, value in (tree or {}).items() if isinstance(tree, dict) else ():
+    for name, value in tree.items() if isinstance(tree, dict) else ():
         if isinstance(value, dict):
             yield from _flatten(value, f"{prefix}{name}.")
         else:
@@ -170,7 +177,7 @@ def _flatten(tree: Any, prefix: str = "") -> Any:
 
 
 def _read_rows(path: Path) -> tuple[list[Row], tuple[str, ...]]:
-    """Return the rows; a half-written last one is left out, and told."""
+    """Return the rows, and a note where a half-written last one is left out."""
     try:
         lines = path.read_text().splitlines(keepends=True) if path.exists() else []
     except UnicodeDecodeError:
@@ -178,52 +185,42 @@ def _read_rows(path: Path) -> tuple[list[Row], tuple[str, ...]]:
     cut = bool(lines) and not lines[-1].endswith("\n")
     rows = []
     for number, line in enumerate(lines[: len(lines) - cut], 1):
-        with contextlib.suppress(ValueError):
-            row = json.loads(line)
-            if isinstance(row, dict) and "stage" in row and ("ticks" in row or "steps" in row):
-                rows.append(row)
-                continue
-        raise ReportError(
-            f"{path}: line {number}: expected a row with stage and ticks or steps, got {line.strip()[:40]!r}"
-        )
+        row = _json_object(line) or {}
+        if "stage" not in row or not row.keys() & {"ticks", "steps"}:
+            expected = "expected a row with stage and ticks or steps"
+            raise ReportError(f"{path}: line {number}: {expected}, got {line.strip()[:40]!r}")
+        rows.append(row)
     return rows, ("the last row of metrics.jsonl is half-written and left out",) if cut else ()
 
 
-def _read_json(path: Path) -> dict[str, Any] | None:
-    try:
-        found = json.loads(path.read_text())
-    except (OSError, ValueError):
-        return None
-    return found if isinstance(found, dict) else None
+def _json_object(source: str | Path) -> dict[str, Any] | None:
+    """Return the JSON object in a text or a file, or None where there is none."""
+    with contextlib.suppress(OSError, ValueError):
+        tree = json.loads(source if isinstance(source, str) else source.read_text())
+        return tree if isinstance(tree, dict) else None
+    return None
 
 
 def _state(run: LoadedRun) -> tuple[str, ...]:
-    """Tell how far a run is that left no summary."""
+    """Note how far a run is that left no summary."""
     if run.summary is not None:
         return ()
     stage = next((row["stage"] for row in reversed(run.rows) if row["stage"] != "evaluate"), "evaluate")
     planned = {"learn": "options.steps", COLLECT: "collect.ticks"}.get(stage, "train.ticks")
-    done = max((int(row["ticks" if "ticks" in row else "steps"]) for row in run.of_stage(stage)), default=0)
     of = f" of {run.fields[planned]:,}" if isinstance(run.fields.get(planned), int) and stage != "total" else ""
     unit = "gradient steps" if stage == "learn" else "ticks"
-    return (f"not finished, or still going (no summary.json): stage {stage} is at {done:,}{of} {unit}",)
+    return (f"not finished, or still going (no summary.json): stage {stage} is at {run.ticks(stage):,}{of} {unit}",)
 
 
 def _stopped(run: LoadedRun) -> tuple[str, ...]:
-    """Tell which seeds diverged."""
-    told = (run.summary or {}).get("stopped") or {}
+    """Note which seeds diverged."""
     notes = [
         f"seed {seed} stopped in stage {stage} after {stop['after']:,}: {stop['quantity']} was not finite"
-        for stage, seeds in told.items()
+        for stage, seeds in ((run.summary or {}).get("stopped") or {}).items()
         for seed, stop in seeds.items()
     ]
     dumps = [path.name for path in sorted(run.folder.glob("dumps/*")) if path.is_dir()] if not notes else []
     return (*notes, *(f"a seed diverged: dumps/{name}" for name in dumps))
-
-
-def default_fields() -> dict[str, Any]:
-    """Return the defaults of every field of the config."""
-    return {name: list(value) if isinstance(value, tuple) else value for name, value in walk(Config())}
 
 
 def per_seed(row: Row, name: str) -> np.ndarray | None:
