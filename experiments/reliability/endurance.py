@@ -1,13 +1,12 @@
 """Leave a run alone for hours, watch its memory and whether it goes on, and stop it as a user would.
 
-python -m taic_jax.experiments.endurance --hours 2 ant --seeds 10 --run-dir runs/long
+python -m taic_jax.experiments.reliability.endurance --hours 2 ant --seeds 10 --run-dir runs/long
 
 What follows the options is for `python -m taic_jax.run`. A run whose stages end before the time is up ends by itself.
 """
 
+import contextlib
 import itertools
-import json
-import signal
 import statistics
 import subprocess
 import sys
@@ -17,7 +16,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
+import psutil
 import tyro
+
+from taic_jax.runtime.run_folder import RunFolder
 
 POLL = 5.0
 SETTLED = 0.2
@@ -37,47 +39,22 @@ class Sample(NamedTuple):
 class Arguments:
     """Watch a run, whose config and options follow, --run-dir among them; exit code 1 if it failed."""
 
-    hours: float = 2.0
-    """After which it is told to stop."""
+    hours: float = 2.0  # After which it is stopped.
 
 
-class Tail:
-    """The rows of a growing metrics.jsonl, each read once."""
-
-    def __init__(self, path: Path):
-        self._path, self._offset, self.rows, self.stage = path, 0, 0, "start"
-
-    def read(self) -> None:
-        """Take in the rows that were added."""
-        if not self._path.is_file():
-            return
-        with self._path.open("rb") as file:
-            file.seek(self._offset)
-            lines = [line for line in file if line.endswith(b"\n")]
-        self._offset += sum(map(len, lines))
-        self.rows += len(lines)
-        if lines:
-            self.stage = json.loads(lines[-1])["stage"]
-
-
-def resident_mib(process: int) -> float:
-    """Return the resident memory of a process; 0 if it has ended."""
-    told = subprocess.run(["ps", "-o", "rss=", "-p", str(process)], capture_output=True, text=True, check=False)
-    return int(told.stdout or 0) / 1024
-
-
-def watch(command: Sequence[str], metrics: Path, seconds: float, poll: float = POLL) -> tuple[list[Sample], int]:
-    """Run a command, stop it by SIGTERM after so many seconds, and return what was seen and its exit code."""
-    samples, tail, begun = [], Tail(metrics), time.monotonic()
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
+def watch(process: subprocess.Popen, run: RunFolder, seconds: float, poll: float = POLL) -> tuple[list[Sample], int]:
+    """Stop a run by SIGTERM after so many seconds, and return samples of it and its exit code."""
+    samples, begun = [], time.monotonic()
+    with process:
         while process.poll() is None:
             time.sleep(poll)
-            tail.read()
             passed = time.monotonic() - begun
-            if mib := resident_mib(process.pid):
-                samples.append(Sample(passed, tail.stage, tail.rows, mib))
+            rows = run.metrics() if run.metrics_path.is_file() else []
+            with contextlib.suppress(psutil.Error):  # it has ended
+                if size := psutil.Process(process.pid).memory_info().rss:
+                    samples.append(Sample(passed, rows[-1]["stage"] if rows else "start", len(rows), size / 2**20))
             if passed > seconds:
-                process.send_signal(signal.SIGTERM)
+                process.terminate()
                 break
     return samples, process.returncode
 
@@ -94,21 +71,18 @@ def growth(samples: Sequence[Sample]) -> float:
 
 def longest_silence(samples: Sequence[Sample]) -> float:
     """Return the most seconds in which no row was added, after the first was."""
-    times = [samples[0].seconds]
-    times += [after.seconds for before, after in itertools.pairwise(samples) if after.rows != before.rows]
-    gaps = zip(times, [*times[1:], samples[-1].seconds], strict=True)
-    return max(after - before for before, after in gaps)
+    added = [after.seconds for before, after in itertools.pairwise(samples) if after.rows != before.rows]
+    times = [samples[0].seconds, *added, samples[-1].seconds]
+    return max(after - before for before, after in itertools.pairwise(times))
 
 
 def report(samples: Sequence[Sample], code: int) -> None:
     """Print a line a stage, and one on the whole."""
     for stage in dict.fromkeys(sample.stage for sample in samples):
         of_stage = [sample for sample in samples if sample.stage == stage]
-        minutes = (of_stage[-1].seconds - of_stage[0].seconds) / 60
-        rows = of_stage[-1].rows - of_stage[0].rows
-        silent = longest_silence(of_stage)
-        memory = f"{of_stage[-1].mib:8.0f} MiB, grown by {growth(of_stage):+.1%}"
-        print(f"{stage:10} {minutes:6.1f} min {rows:6} rows {memory}; silent for {silent:.0f} s")
+        first, last = of_stage[0], of_stage[-1]
+        memory = f"{last.mib:8.0f} MiB, grown by {growth(of_stage):+.1%}; silent for {longest_silence(of_stage):.0f} s"
+        print(f"{stage:10} {(last.seconds - first.seconds) / 60:6.1f} min {last.rows - first.rows:6} rows {memory}")
     print(f"{samples[-1].seconds / 3600:.2f} h, exit code {code}, at most {max(s.mib for s in samples):.0f} MiB")
 
 
@@ -118,10 +92,9 @@ def main(args: Sequence[str] | None = None) -> int:
     if "--run-dir" not in run[:-1]:
         print("endurance: expected --run-dir DIR among the options of the run", file=sys.stderr)
         return 2
-    folder = Path(run[run.index("--run-dir") + 1])
-    samples, code = watch(
-        [sys.executable, "-m", "taic_jax.run", *run], folder / "metrics.jsonl", arguments.hours * 3600
-    )
+    folder = RunFolder(Path(run[run.index("--run-dir") + 1]))
+    process = subprocess.Popen([sys.executable, "-m", "taic_jax.run", *run], stdout=subprocess.DEVNULL)
+    samples, code = watch(process, folder, arguments.hours * 3600)
     if samples:
         report(samples, code)
     return 0 if code in (0, 75) else 1
