@@ -1,4 +1,4 @@
-"""What the benchmark's commands share: their arguments, tables on the terminal, and figures in a JSON file."""
+"""The frame of the benchmark's commands: arguments, tables on the terminal, and figures in a JSON file."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ Row = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Command:
-    """What every command takes."""
+    """The arguments of every command."""
 
     json: Path | None = None  # Also write the figures to this file.
 
@@ -54,7 +54,7 @@ def show(rows: Iterable[Row]) -> list[Row]:
 def _print(names: Iterable[str], cells: Iterable[Any]) -> None:
     """Print cells to the right of columns as wide as their names, the first one to the left."""
     texts = [_text(cell).rjust(max(len(name), 9)) for name, cell in zip(names, cells, strict=True)]
-    print(f"{texts[0].strip():32}", *texts[1:], sep="  ", flush=True)
+    print("  ".join([f"{texts[0].strip():32}", *texts[1:]]).rstrip(), flush=True)
 
 
 def _text(cell: Any) -> str:

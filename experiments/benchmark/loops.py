@@ -1,4 +1,4 @@
-"""What the benchmark measures of ours: the engine alone, rollouts, and training, flat and over options.
+"""The loops of ours that the benchmark measures: the engine alone, rollouts, and training, flat and over options.
 
 Each function returns the loop to call again and again; all that is called before is left out of the measurement.
 """
@@ -26,10 +26,10 @@ from taic_jax.runtime.devices import Devices
 from taic_jax.types import as_arrays
 
 WORK = PPOConfig(num_envs=64, rollout_length=256, epochs=10, minibatch_size=512)
-"""What an iteration of training is everywhere here: 64 x 256 ticks, 10 epochs of 32 minibatches, 64x64 networks."""
+"""An iteration of training, everywhere here: 64 x 256 ticks, 10 epochs of 32 minibatches, 64x64 networks."""
 VARIABLE_LENGTH = 10
 """The most ticks that options take which may end earlier: those of termination fixed are 5 ticks long."""
-SEEN = 16, 1024
+EXPERIENCE = 16, 1024
 """Environments, and ticks of each, that options are learnt from."""
 ONE_DEVICE = Devices()
 ITERATIONS = 100
@@ -61,7 +61,7 @@ def stepping(
     actions: Float[Array, "T B A"],
     read: Callable[[envs.State, Array, envs.State], Any] = lambda before, action, after: (before.obs, before.reward),
 ) -> Loop:
-    """Return the task's own compiled loop: engine, rewards, time limit and automatic resets under given actions.
+    """Return the task's own compiled loop: engine, rewards, time limit and automatic resets under these actions.
 
     It gives the last state, and whatever is read of each state, the action there, and the state after.
     """
@@ -129,7 +129,7 @@ class Training:
 
 def untrained_ticks(env: envs.Env) -> Rollout:
     """Return ticks [T, B] to learn options from: enough of each environment to hold a part of them out."""
-    return untrained_rollout(env, *SEEN).run()[1]
+    return untrained_rollout(env, *EXPERIENCE).run()[1]
 
 
 def executor_of(env: envs.Env, config: OptionsConfig | None, ticks: Rollout | None = None) -> Executor:

@@ -1,4 +1,4 @@
-"""What takes processes to measure: starts with an empty and a filled cache, seeds over cores, a sweep run by run."""
+"""Measurements that take processes: starts with an empty and a filled cache, seeds over cores, a sweep run by run."""
 
 import contextlib
 import multiprocessing

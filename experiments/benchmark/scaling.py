@@ -1,4 +1,4 @@
-"""Where the time of an iteration goes, and how the time of a tick grows with what may grow by a factor of 16."""
+"""The parts of an iteration's time, and how the time of a tick grows with what may grow by a factor of 16."""
 
 import itertools
 import tempfile

@@ -160,7 +160,7 @@ def report(arguments: Arguments) -> dict[str, Any]:
     for name in ("engine", "rollout", "flat_training", HEADLINE):
         figures[name] = rows.get(name, {}).get("ticks_per_second")
     figures |= {"device": jax.devices()[0].device_kind, "task": arguments.task, "rows": rows}
-    show({f"{arguments.task} on {figures['device']}": name} | row for name, row in rows.items())
+    show({f"{arguments.task} on {figures['device']}": name} | cells for name, cells in rows.items())
     figures["shares"] = shares(env, arguments.training, arguments.rounds)
     print("share of an iteration:", ", ".join(share_text(*share) for share in figures["shares"].items()))
     if arguments.checkpoints:
@@ -186,7 +186,7 @@ def share_text(name: str, share: float) -> str:
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Print the tables and return the exit code: 2 for a mistake of the user, told in one line."""
+    """Print the tables and return the exit code: 2 after one line on a mistake of the user."""
     return answer(Arguments, report, args)
 
 

@@ -2,7 +2,7 @@
 
 python -m taic_jax.experiments.reliability.endurance --hours 2 ant --seeds 10 --run-dir runs/long
 
-What follows the options is for `python -m taic_jax.run`. A run whose stages end before the time is up ends by itself.
+Further arguments are those of `python -m taic_jax.run`. A run whose stages end before the time is up ends by itself.
 """
 
 import contextlib
@@ -27,7 +27,7 @@ SETTLED = 0.2
 
 
 class Sample(NamedTuple):
-    """What a run was at: seconds since its start, stage of its last logged row, rows so far, resident MiB."""
+    """The state of a run: seconds since its start, stage of its last logged row, rows so far, resident MiB."""
 
     seconds: float
     stage: str

@@ -3,7 +3,7 @@
 python -m taic_jax.experiments.reliability.kills --kills 50
 
 Each is killed once by SIGKILL, at a moment drawn uniformly over the length of a whole run with a whole sweep after it,
-start and compilation included. Compiled programs are kept in a cache, so that a run is mostly what is tested.
+start and compilation included. Compiled programs are cached, so that a run is mostly what is tested.
 """
 
 import contextlib
