@@ -13,7 +13,10 @@ import numpy as np
 class Ticking(Protocol):
     """Something to measure: a call runs it once, and makes so many ticks."""
 
-    ticks: int
+    @property
+    def ticks(self) -> int:
+        """Ticks that one call makes."""
+        ...
 
     def __call__(self) -> Any: ...
 
