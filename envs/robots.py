@@ -38,7 +38,7 @@ class Robot:
     timestep: float | None = None  # s
     integrator: mujoco.mjtIntegrator | None = None
     gear: float | None = None  # N m, of every motor at an action of 1
-    # MJX's solver and line search; None for the model's own. `experiments.worlds --solver` measures them.
+    # MJX's solver and line search; None for the model's own. `experiments.benchmark.worlds --solver` measures them.
     iterations: int | None = None
     ls_iterations: int | None = 4
     # How obs and action look from the next of `sides` equal sides of the body (see `views`).

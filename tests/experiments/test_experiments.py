@@ -1,6 +1,5 @@
 """The commands that measure: that they run, say what they should, and do nothing twice. Not what they measure."""
 
-import json
 import sys
 from pathlib import Path
 
@@ -8,30 +7,11 @@ import numpy as np
 import pytest
 
 from taic_jax.config import PPOConfig
-from taic_jax.experiments import flat_scores, worlds
+from taic_jax.experiments import flat_scores
 from taic_jax.experiments.cells import all_cells
 from taic_jax.experiments.table import TABLE, config_hash, curves_of, difference, read_table
 
 TINY = PPOConfig(num_envs=4, rollout_length=32, minibatch_size=32, epochs=1)
-
-
-def test_table_of_worlds_has_a_row_for_each_task_and_backend(monkeypatch, tmp_path, capsys):
-    out = tmp_path / "worlds.json"
-    arguments = ["--tasks", "nav2d", "hopper", "--backends", "mujoco", "--num-envs", "4", "--length", "4", "--json"]
-    monkeypatch.setattr(sys, "argv", ["worlds", *arguments, str(out)])
-    worlds.main()
-    nav2d, hopper = json.loads(out.read_text())
-    assert (nav2d["task"], nav2d["obs"], nav2d["act"], nav2d["envs"]) == ("nav2d", 2, 2, 4)
-    assert (hopper["task"], hopper["backend"], hopper["obs"], hopper["contacts"]) == ("hopper", "mujoco", 11, 2)
-    assert hopper["ratio"] == pytest.approx(hopper["ticks_per_second"] / hopper["bare"], rel=0.5)
-    assert "hopper" in capsys.readouterr().out
-
-
-def test_soak_counts_what_leaves_the_arena(monkeypatch, capsys):
-    arguments = ["--soak", "--tasks", "ant_maze", "--backends", "mujoco", "--num-envs", "2", "--length", "8"]
-    monkeypatch.setattr(sys, "argv", ["worlds", *arguments])
-    worlds.main()
-    assert "outside 0  nan 0" in capsys.readouterr().out
 
 
 def test_flat_scores_are_a_row_each_and_not_measured_twice(monkeypatch, tmp_path, capsys):

@@ -12,13 +12,9 @@ from taic_jax.config import PPOConfig
 
 
 class EnvPoolPPO:
-    """Train on EnvPool, an iteration a call; observations and rewards as they come, which costs less.
+    """Train on EnvPool, which has threads of its own, an iteration a call; observations and rewards as they come.
 
-    Args:
-      name: the environment's in EnvPool.
-      config: the work.
-      env_threads: of EnvPool.
-      threads: of PyTorch.
+    That costs less than to normalise them.
     """
 
     def __init__(self, name: str, config: PPOConfig, env_threads: int, threads: int):
@@ -48,7 +44,7 @@ class EnvPoolPPO:
     @torch.no_grad()
     def _rollout(self) -> list[Tensor]:
         """Return obs, actions, log-probabilities, advantages and targets of T B ticks."""
-        kept: list[list[Tensor]] = [[] for _ in range(6)]
+        columns: list[list[Tensor]] = [[] for _ in range(6)]
         for _ in range(self._config.rollout_length):
             obs = torch.as_tensor(self.obs, dtype=torch.float32)
             policy = self._policy(obs)
@@ -59,9 +55,9 @@ class EnvPoolPPO:
             done = torch.as_tensor(terminated | truncated, dtype=torch.float32)
             tick = (obs, action, policy.log_prob(action).sum(1), self._critic(obs)[:, 0],
                     torch.as_tensor(reward, dtype=torch.float32), done)  # fmt: skip
-            for values, value in zip(kept, tick, strict=True):
+            for values, value in zip(columns, tick, strict=True):
                 values.append(value)
-        obs, action, log_prob, value, reward, done = (torch.stack(values) for values in kept)
+        obs, action, log_prob, value, reward, done = (torch.stack(values) for values in columns)
         next_value, total = self._critic(torch.as_tensor(self.obs, dtype=torch.float32))[:, 0], torch.zeros(())
         advantage = torch.zeros_like(reward)
         for t in reversed(range(len(reward))):

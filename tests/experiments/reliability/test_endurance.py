@@ -1,11 +1,13 @@
 """A run that is left alone: what is told of its memory and its silence."""
 
+import subprocess
 import sys
 
 import pytest
 
-from taic_jax.experiments import endurance
-from taic_jax.experiments.endurance import Sample, growth, longest_silence
+from taic_jax.experiments.reliability import endurance
+from taic_jax.experiments.reliability.endurance import Sample, growth, longest_silence
+from taic_jax.runtime.run_folder import RunFolder
 
 
 def samples(*mib: float) -> list[Sample]:
@@ -24,6 +26,7 @@ def test_the_longest_silence_is_between_rows_or_at_the_end():
 
 
 def test_a_command_that_goes_on_is_stopped_and_a_leak_is_seen(tmp_path):
+    run = RunFolder(tmp_path)
     code = """if True:
         import pathlib, time
         kept = []
@@ -32,8 +35,8 @@ def test_a_command_that_goes_on_is_stopped_and_a_leak_is_seen(tmp_path):
             with pathlib.Path("metrics").open("a") as file:
                 file.write('{"stage": "train"}\\n')
             time.sleep(0.01)
-    """.replace('"metrics"', repr(str(tmp_path / "metrics")))
-    seen, exit_code = endurance.watch([sys.executable, "-c", code], tmp_path / "metrics", 3.0, poll=0.1)
+    """.replace('"metrics"', repr(str(run.metrics_path)))
+    seen, exit_code = endurance.watch(subprocess.Popen([sys.executable, "-c", code]), run, 3.0, poll=0.1)
     assert exit_code == -15 and seen[-1].stage == "train" and seen[-1].rows > 20
     assert growth(seen) > 0.5 and longest_silence(seen) < 2
 

@@ -12,13 +12,13 @@ from tiny_runs import CONFIG, with_fields
 from taic_jax import envs
 from taic_jax.config import PPOConfig
 from taic_jax.config_io import to_yaml
-from taic_jax.experiments import peers, processes, throughput
-from taic_jax.experiments.costs import SMALLEST, Saved, Widened, scaling, shares
-from taic_jax.experiments.loops import WORK, Training, options_config
-from taic_jax.experiments.peers import brax_ppo
-from taic_jax.experiments.processes import Sweep, starts, sweep_costs
-from taic_jax.experiments.throughput import share_text
-from taic_jax.experiments.turns import Loop, Speeds, take_turns
+from taic_jax.experiments.benchmark import peers, processes, throughput
+from taic_jax.experiments.benchmark.loops import WORK, Training, options_config
+from taic_jax.experiments.benchmark.peers import brax_ppo
+from taic_jax.experiments.benchmark.processes import Sweep, starts, sweep_costs
+from taic_jax.experiments.benchmark.scaling import SAVED, SMALLEST, Widened, saving_loop, scaling, shares
+from taic_jax.experiments.benchmark.throughput import share_text
+from taic_jax.experiments.benchmark.timing import Loop, Speeds, interleave
 from taic_jax.options.execution import IdentityExecutor
 from taic_jax.runtime.checkpoint import Checkpoints
 
@@ -38,14 +38,14 @@ def test_the_work_is_the_one_promised():
 
 def test_loops_take_turns():
     calls: list[str] = []
-    loops = [Loop(name, lambda name=name: calls.append(name), 10) for name in "ab"]
-    speeds = take_turns(loops, 3)
+    speeds = interleave({name: Loop(lambda name=name: calls.append(name), 10) for name in "ab"}, 3)
     assert "".join(calls) == "ab" * 4
     assert len(speeds["a"].rounds) == 3
 
 
 def test_a_ratio_is_the_median_of_the_rounds():
     assert Speeds([1.0, 8.0, 9.0], 0.0).ratio(Speeds([1.0, 2.0, 3.0], 0.0)) == 3.0
+    assert Speeds([1.0, 8.0, 9.0], 0.0).ratio(Speeds([2.0], None)) == 4.0
 
 
 @pytest.mark.parametrize("seeds", [1, 2])
@@ -76,7 +76,7 @@ def test_gymnasium_environments_look_like_ours(task):
 
 def test_stable_baselines_does_the_same_work():
     pytest.importorskip("stable_baselines3")
-    from taic_jax.experiments.peers.stable_baselines import StableBaselines
+    from taic_jax.experiments.benchmark.peers.stable_baselines import StableBaselines
 
     peer = StableBaselines("HalfCheetah-v5", {}, TINY, 1)
     peer()
@@ -88,7 +88,7 @@ def test_stable_baselines_does_the_same_work():
 @pytest.mark.parametrize("task", sorted(peers.ENVPOOL))
 def test_envpool_does_the_same_work(task):
     pytest.importorskip("envpool")
-    from taic_jax.experiments.peers.pytorch_ppo import EnvPoolPPO
+    from taic_jax.experiments.benchmark.peers.pytorch_ppo import EnvPoolPPO
 
     peer = EnvPoolPPO(peers.ENVPOOL[task], TINY, 1, 1)
     assert peer.obs.shape == (2, envs.make_env(task, model="gym").observation_size)
@@ -102,7 +102,7 @@ def test_the_fastest_setting_is_kept_and_the_others_closed(monkeypatch):
     class Fake:
         closed = False
 
-        def __init__(self, taken: float):
+        def __init__(self, taken: int):
             self.taken = taken
             made.append(self)
 
@@ -113,8 +113,8 @@ def test_the_fastest_setting_is_kept_and_the_others_closed(monkeypatch):
 
     made: list[Fake] = []
     monkeypatch.setattr(peers, "seconds", lambda peer: peer.taken)
-    best, setting = peers.fastest((str(taken), lambda taken=taken: Fake(taken)) for taken in (2.0, 1.0, 3.0))
-    assert (best, setting) == (made[1], "1.0")
+    best, setting = peers.fastest(Fake, (2, 1, 3))
+    assert (best, setting) == (made[1], "1 threads")
     assert [peer.closed for peer in made] == [True, False, True]
 
 
@@ -187,20 +187,20 @@ def test_a_share_that_noise_made_negative_is_no_share():
 def test_peers_that_are_missing_are_told(monkeypatch):
     for package, module in (("stable_baselines3", "stable_baselines"), ("envpool", "pytorch_ppo")):
         monkeypatch.setitem(sys.modules, package, None)
-        monkeypatch.delitem(sys.modules, f"taic_jax.experiments.peers.{module}", raising=False)
+        monkeypatch.delitem(sys.modules, f"taic_jax.experiments.benchmark.peers.{module}", raising=False)
     arguments = throughput.Arguments(training=TINY)
-    loops, remarks = throughput.peer_loops(arguments)
+    loops, remarks = peers.loops(arguments.task, arguments.training)
     assert not loops
     assert all("pip install 'taic-jax[peers]'" in remark for remark in remarks.values())
 
 
 def test_training_is_saved_after_each_iteration(tmp_path):
     training = Training(envs.make_env("nav2d"), IdentityExecutor(2), TINY)
-    saved = Saved(training, tmp_path)
+    saved = saving_loop(training, Checkpoints(tmp_path))
     saved()
     checkpoints = Checkpoints(tmp_path)
-    assert checkpoints.latest_step() == Saved.ITERATIONS and saved.ticks == Saved.ITERATIONS * TICKS
-    assert int(checkpoints.load(Saved.ITERATIONS, training.state).iteration) == Saved.ITERATIONS
+    assert checkpoints.latest_step() == SAVED and saved.ticks == SAVED * TICKS
+    assert int(checkpoints.load(SAVED, training.state).iteration) == SAVED
 
 
 def test_a_task_without_an_engine_has_no_such_row():
@@ -220,12 +220,11 @@ def test_scaling_goes_over_a_factor_of_16_each(monkeypatch):
 
         def __call__(self) -> None: ...
 
-    monkeypatch.setattr("taic_jax.experiments.costs._at", Fake)
+    monkeypatch.setattr("taic_jax.experiments.benchmark.scaling._at", Fake)
     rows = list(scaling(envs.make_env("nav2d"), TINY, 1, 1))
     for axis in SMALLEST:
-        values = [row.value for row in rows if row.axis == axis]
-        assert values[-1] == 16 * values[0]
-        assert [row.of_linear for row in rows if row.axis == axis and row.value == values[0]] == [1.0]
+        first, _, last = (row for row in rows if row["axis"] == axis)
+        assert last["value"] == 16 * first["value"] and first["of_linear"] == 1.0
 
 
 def test_a_sweep_is_counted_up_from_what_was_measured(monkeypatch):

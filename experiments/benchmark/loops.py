@@ -1,4 +1,4 @@
-"""What the benchmark measures of ours: the engine alone, rollouts, and training, flat and over options.
+"""The loops of ours that the benchmark measures: the engine alone, rollouts, and training, flat and over options.
 
 Each function returns the loop to call again and again; all that is called before is left out of the measurement.
 """
@@ -17,18 +17,19 @@ from jaxtyping import Array, Float
 from taic_jax import envs
 from taic_jax.artifacts.experience import as_experience
 from taic_jax.config import OptionsConfig, PPOConfig
-from taic_jax.options.execution import Executor, IdentityExecutor, OptionExecutor, make_executor
+from taic_jax.experiments.benchmark.timing import Loop
+from taic_jax.options.execution import Executor, IdentityExecutor, make_executor
 from taic_jax.options.learning import learn
 from taic_jax.rl import ppo
-from taic_jax.rl.rollout import Rollout, RolloutCarry, rollout, start
+from taic_jax.rl.rollout import Rollout, rollout, start
 from taic_jax.runtime.devices import Devices
 from taic_jax.types import as_arrays
 
 WORK = PPOConfig(num_envs=64, rollout_length=256, epochs=10, minibatch_size=512)
-"""What an iteration of training is everywhere here: 64 x 256 ticks, 10 epochs of 32 minibatches, 64x64 networks."""
+"""An iteration of training, everywhere here: 64 x 256 ticks, 10 epochs of 32 minibatches, 64x64 networks."""
 VARIABLE_LENGTH = 10
 """The most ticks that options take which may end earlier: those of termination fixed are 5 ticks long."""
-SEEN = 16, 1024
+EXPERIENCE = 16, 1024
 """Environments, and ticks of each, that options are learnt from."""
 ONE_DEVICE = Devices()
 ITERATIONS = 100
@@ -40,46 +41,54 @@ def has_engine(env: envs.Env) -> bool:
     return hasattr(getattr(env, "physics", None), "engine")
 
 
-def untrained_rollout(
-    env: envs.Env, num_envs: int, length: int
-) -> tuple[Callable[[RolloutCarry], tuple[RolloutCarry, Rollout]], RolloutCarry]:
-    """Return a compiled rollout of `length` ticks with an untrained policy, and its start."""
+def untrained_rollout(env: envs.Env, num_envs: int, length: int) -> Loop:
+    """Return a compiled rollout of `length` ticks with an untrained policy, which gives the carry and the ticks."""
     executor, key = IdentityExecutor(env.action_size), jax.random.key(0)
     state = ppo.init(as_arrays(PPOConfig(num_envs=num_envs)), env, executor, key)
     decide = ppo.as_agent(PPOConfig(), executor, state).decide()
     wrapped = envs.AutoReset(env)
-    compiled = jax.jit(lambda running: rollout(wrapped, executor, decide, running, key, length))
-    return compiled, start(wrapped, executor, num_envs, key)
+    compiled = jax.jit(lambda carry: rollout(wrapped, executor, decide, carry, key, length))
+    return Loop(partial(compiled, start(wrapped, executor, num_envs, key)), num_envs * length)
 
 
-def stepping(env: envs.Env, actions: Float[Array, "T B A"]) -> Callable[[], Any]:
-    """Return the task's own compiled loop: engine, rewards, time limit and automatic resets under given actions."""
+def random_actions(env: envs.Env, num_envs: int, length: int) -> Float[Array, "T B A"]:
+    """Draw actions from a uniform distribution."""
+    return jax.random.uniform(jax.random.key(1), (length, num_envs, env.action_size), minval=-1.0)
+
+
+def stepping(
+    env: envs.Env,
+    actions: Float[Array, "T B A"],
+    read: Callable[[envs.State, Array, envs.State], Any] = lambda before, action, after: (before.obs, before.reward),
+) -> Loop:
+    """Return the task's own compiled loop: engine, rewards, time limit and automatic resets under these actions.
+
+    It gives the last state, and whatever is read of each state, the action there, and the state after.
+    """
     wrapped = envs.AutoReset(env)
-    state = jax.jit(jax.vmap(wrapped.reset))(jax.random.split(jax.random.key(0), actions.shape[1]))
+    begin = jax.jit(jax.vmap(wrapped.reset))(jax.random.split(jax.random.key(0), actions.shape[1]))
     step = jax.vmap(wrapped.step)
 
-    def run(state: envs.State) -> tuple[envs.State, Any]:
-        return jax.lax.scan(lambda state, action: (step(state, action), (state.obs, state.reward)), state, actions)
+    def tick(before: envs.State, action: Array) -> tuple[envs.State, Any]:
+        after = step(before, action)
+        return after, read(before, action, after)
 
-    compiled = jax.jit(run)
-    return lambda: jax.block_until_ready(compiled(state))
+    compiled = jax.jit(lambda state: jax.lax.scan(tick, state, actions))
+    return Loop(partial(compiled, begin), actions[..., 0].size)
 
 
-def bare_engine(env: envs.Env, actions: Float[Array, "T B A"]) -> Callable[[], Any]:
+def bare_engine(env: envs.Env, actions: Float[Array, "T B A"]) -> Loop:
     """Return a loop over `mujoco.batch` from NumPy that steps the very states which `stepping` steps.
 
     They are set at each tick: alone, robots that nothing resets soon lie on the ground or fall through it,
     which costs the engine more or less than what it is compared with.
     """
-    wrapped = envs.AutoReset(env)
-    step = jax.vmap(wrapped.step)
 
-    def tick(state: envs.State, action: Array) -> tuple[envs.State, Array]:
-        sent = [state.physics.qpos, state.physics.qvel, state.physics.qacc_warmstart, action]
-        return step(state, action), jnp.concatenate(sent, axis=1)
+    def sent(state: envs.State, action: Array, _: envs.State) -> Array:
+        physics = state.physics
+        return jnp.concatenate([physics.qpos, physics.qvel, physics.qacc_warmstart, action], axis=1)
 
-    begin = jax.jit(jax.vmap(wrapped.reset))(jax.random.split(jax.random.key(0), actions.shape[1]))
-    states = np.asarray(jax.jit(lambda state: jax.lax.scan(tick, state, actions)[1])(begin), np.float64)
+    states = np.asarray(stepping(env, actions, sent).run()[1], np.float64)
     batch = mujoco.batch.Batch(env.model, actions.shape[1], env.physics.num_threads)
     rows = batch.state[:, 1 : 1 + states.shape[2]]  # behind the time
 
@@ -88,33 +97,23 @@ def bare_engine(env: envs.Env, actions: Float[Array, "T B A"]) -> Callable[[], A
             rows[...] = row
             batch.step(nstep=env.physics.substeps)
 
-    return run
+    return Loop(run, actions[..., 0].size)
 
 
 class Training:
-    """An iteration of PPO, compiled: rollout, advantages and all updates, of K seeds side by side.
-
-    Args:
-      env: the task.
-      executor: of options, or of actions themselves.
-      config: the work.
-      seeds: K.
-      devices: that the seeds are split over.
-    """
+    """An iteration of PPO, compiled: rollout, advantages and all updates, of seeds side by side, split over devices."""
 
     def __init__(
         self, env: envs.Env, executor: Executor, config: PPOConfig, seeds: int = 1, devices: Devices = ONE_DEVICE
     ):
-        self.ticks = seeds * config.num_envs * config.rollout_length
-        self.duration = 1.0
-        arrays = as_arrays(config)
-        keys = jax.random.split(jax.random.key(0), seeds)
-        step = partial(ppo.iterate, arrays, env, executor, ITERATIONS)
+        self.ticks, self.duration = seeds * config.num_envs * config.rollout_length, 1.0
+        arrays, keys = as_arrays(config), jax.random.split(jax.random.key(0), seeds)
         init = partial(ppo.init, arrays, env, executor)
-        state = jax.jit(jax.vmap(init) if seeds > 1 else lambda keys: init(keys[0]))(keys)
+        iterate = partial(ppo.iterate, arrays, env, executor, ITERATIONS)
+        state = jax.jit(jax.vmap(init) if seeds > 1 else init)(keys if seeds > 1 else keys[0])
         self.state = devices.place(state)
-        iterate = jax.vmap(lambda state: step(state)[:2]) if seeds > 1 else lambda state: step(state)[:2]
-        self._step = devices.compile(iterate, self.state, donate=True)
+        step = jax.vmap(lambda state: iterate(state)[:2]) if seeds > 1 else lambda state: iterate(state)[:2]
+        self._step = devices.compile(step, self.state, donate=True)
 
     def __call__(self) -> None:
         """Train for one iteration more than before."""
@@ -130,17 +129,20 @@ class Training:
 
 def untrained_ticks(env: envs.Env) -> Rollout:
     """Return ticks [T, B] to learn options from: enough of each environment to hold a part of them out."""
-    compiled, begin = untrained_rollout(env, *SEEN)
-    return compiled(begin)[1]
+    return untrained_rollout(env, *EXPERIENCE).run()[1]
 
 
-def learnt_executor(env: envs.Env, ticks: Rollout, config: OptionsConfig) -> OptionExecutor:
-    """Return options learnt from the ticks of an untrained policy: how good they are changes no speed, how long does.
+def executor_of(env: envs.Env, config: OptionsConfig | None, ticks: Rollout | None = None) -> Executor:
+    """Return options learnt from ticks of an untrained policy: how good they are changes no speed, how long does.
+
+    Without a config, return actions themselves.
 
     Raises:
       ShortExperienceError: delta is a quantile, and the ticks are too few to hold a part of them out.
     """
-    experience = as_experience(ticks, env.proprioceptive_size)
+    if config is None:
+        return IdentityExecutor(env.action_size)
+    experience = as_experience(untrained_ticks(env) if ticks is None else ticks, env.proprioceptive_size)
     model, _ = jax.jit(lambda experience: learn(config, experience, jax.random.key(0)))(experience)
     return make_executor(config, model)
 

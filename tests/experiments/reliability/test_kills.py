@@ -1,10 +1,10 @@
-"""Killed at random moments, resumed, the same to the last bit; `experiments.kills` does it at length."""
+"""Killed at random moments, resumed, the same to the last bit; `experiments.reliability.kills` does it at length."""
 
 import sys
 
 import pytest
 
-from taic_jax.experiments import kills
+from taic_jax.experiments.reliability import kills
 
 
 @pytest.mark.timeout(1200)

@@ -13,11 +13,7 @@ from taic_jax.config import PPOConfig
 class StableBaselines:
     """Train with Stable-Baselines3, an iteration a call; observations and rewards as they come, which costs less.
 
-    Args:
-      name: the environment's in Gymnasium.
-      options: of `gymnasium.make`.
-      config: the work.
-      threads: of PyTorch.
+    The environment's name and options are those of `gymnasium.make`, the threads PyTorch's.
     """
 
     def __init__(self, name: str, options: dict[str, Any], config: PPOConfig, threads: int):

@@ -1,5 +1,6 @@
-"""What takes processes to measure: starts with an empty and a filled cache, seeds over cores, a sweep run by run."""
+"""Measurements that take processes: starts with an empty and a filled cache, seeds over cores, a sweep run by run."""
 
+import contextlib
 import multiprocessing
 import os
 import subprocess
@@ -17,13 +18,13 @@ import jax
 from taic_jax import envs
 from taic_jax.config import OptionsConfig, PPOConfig
 from taic_jax.envs.physics.mujoco import num_physical_cores
-from taic_jax.experiments.loops import Training, learnt_executor, untrained_ticks
-from taic_jax.experiments.turns import seconds
-from taic_jax.options.execution import Executor, IdentityExecutor
+from taic_jax.experiments.benchmark.loops import Training, executor_of
+from taic_jax.experiments.benchmark.timing import seconds
+from taic_jax.options.execution import IdentityExecutor
 from taic_jax.rl import ppo
 from taic_jax.runtime.devices import Devices, open_devices
-from taic_jax.runtime.logging import read_metrics
 from taic_jax.runtime.program_cache import keep_programs
+from taic_jax.runtime.run_folder import RunFolder
 from taic_jax.types import as_arrays, as_rows
 
 PATIENCE = 600.0
@@ -48,30 +49,24 @@ def _next_iteration(task: str, folder: Path, run_dir: Path, *options: str) -> fl
     environment = {key: value for key, value in os.environ.items() if not key.startswith("JAX_COMPILATION_CACHE")}
     environment |= {"XDG_CACHE_HOME": str(folder / "cache")}
     command = [sys.executable, "-m", "taic_jax.run", task, "--run-dir", str(run_dir), *options]
-    rows = run_dir / "metrics.jsonl"
-    before = len(read_metrics(rows)) if rows.is_file() else 0
-    begun = time.perf_counter()
-    with subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as run:
+    run = RunFolder(run_dir)
+    before, begun = len(run.metrics()) if run.metrics_path.is_file() else 0, time.perf_counter()
+    with subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
         try:
-            while not rows.is_file() or len(read_metrics(rows)) <= before:
-                if run.poll() is not None or time.perf_counter() - begun > PATIENCE:
-                    raise RuntimeError(f"{' '.join(command)} logged nothing: exit code {run.poll()}")
+            while not run.metrics_path.is_file() or len(run.metrics()) <= before:
+                if process.poll() is not None or time.perf_counter() - begun > PATIENCE:
+                    raise RuntimeError(f"{' '.join(command)} logged nothing: exit code {process.poll()}")
                 time.sleep(POLL)
             return time.perf_counter() - begun
         finally:
-            run.terminate()
+            process.terminate()
 
 
 class SeedsApart:
     """Training of K seeds in a process of its own, split over its devices as those of a run are: the cores of a CPU.
 
     A process has its devices once and for all, and beside these loops one seed is to have all cores as one device.
-
-    Args:
-      make_env: makes the task, in that process.
-      config: the work.
-      seeds: K.
-      options: are learnt there first; without them, training is flat.
+    There the task is made, and options are learnt first; without them, training is flat.
     """
 
     def __init__(
@@ -100,21 +95,15 @@ class SeedsApart:
 def _serve(
     pipe: Connection, make_env: Callable[[], envs.Env], config: PPOConfig, seeds: int, options: OptionsConfig | None
 ) -> None:
-    """Train for an iteration whenever the other end asks, and tell it how many ticks a decision took."""
+    """Train for an iteration whenever the other end asks, and reply how many ticks a decision took."""
     keep_programs()
-    shard = open_devices("auto", seeds)
-    env = make_env()
-    executor: Executor = IdentityExecutor(env.action_size)
-    if options is not None:
-        executor = learnt_executor(env, untrained_ticks(env), options)
-    training = Training(env, executor, config, seeds, Devices(shard))
-    while True:
-        try:
+    devices, env = Devices(open_devices("auto", seeds)), make_env()
+    training = Training(env, executor_of(env, options), config, seeds, devices)
+    with contextlib.suppress(EOFError):
+        while True:
             pipe.recv()
-        except EOFError:
-            return
-        training()
-        pipe.send(training.duration)
+            training()
+            pipe.send(training.duration)
 
 
 @dataclass(frozen=True)
@@ -149,23 +138,23 @@ def sweep_costs(sweep: Sweep, runs: int) -> dict[str, int | float]:
     """Return the seconds of a sweep in one program, in a loop over a compiled run, and in separate processes.
 
     The first is measured whole; of the others `runs` runs each, counted up to all of them. Processes run as many at a
-    time as there are cores, with a filled cache. Compilation, which the first two do once, is told apart; the first
+    time as there are cores, with a filled cache. Compilation, which the first two do once, is separate; the first
     splits its rows over devices, as a sweep does.
     """
-    told: dict[str, int | float] = {"runs": (total := sweep.points * sweep.seeds), "runs_measured": runs}
+    costs: dict[str, int | float] = {"runs": (total := sweep.points * sweep.seeds), "runs_measured": runs}
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:  # with devices of its own
-        told["compile_one_program"], told["one_program"] = pool.submit(_one_program, sweep).result()
+        costs["compile_one_program"], costs["one_program"] = pool.submit(_one_program, sweep).result()
     rows, keys = sweep.rows()
     each = [(jax.tree.map(lambda x, i=i: x[i], rows), keys[i]) for i in range(runs)]
     begun = time.perf_counter()
     program = Devices().compile(sweep.train(), *each[0])
-    told["compile_loop"] = time.perf_counter() - begun
-    told["loop"] = seconds(lambda: [jax.block_until_ready(program(*run)) for run in each]) * total / runs
+    costs["compile_loop"] = time.perf_counter() - begun
+    costs["loop"] = seconds(lambda: [jax.block_until_ready(program(*run)) for run in each]) * total / runs
     _processes(sweep, 1)  # fills the cache
     cores = num_physical_cores()
     rounds = max(1, runs // cores)
-    told["processes"] = seconds(lambda: [_processes(sweep, cores) for _ in range(rounds)]) * total / (rounds * cores)
-    return told
+    costs["processes"] = seconds(lambda: [_processes(sweep, cores) for _ in range(rounds)]) * total / (rounds * cores)
+    return costs
 
 
 def _one_program(sweep: Sweep) -> tuple[float, float]:
@@ -178,10 +167,9 @@ def _one_program(sweep: Sweep) -> tuple[float, float]:
 
 def _processes(sweep: Sweep, count: int) -> None:
     """Run the first points of a sweep in `count` processes at once."""
-    names = "from taic_jax.config import PPOConfig; from taic_jax.experiments.processes import Sweep, run_alone"
+    names = f"from taic_jax.config import PPOConfig; from {__name__} import Sweep, run_alone"
     code = [f"{names}; run_alone({sweep!r}, {point})" for point in range(count)]
-    started = [subprocess.Popen([sys.executable, "-W", "ignore", "-c", text]) for text in code]
-    for process in started:
+    for process in [subprocess.Popen([sys.executable, "-W", "ignore", "-c", text]) for text in code]:
         if process.wait():
             raise RuntimeError(f"run {sweep} alone: exit code {process.returncode}")
 

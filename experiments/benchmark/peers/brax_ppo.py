@@ -3,7 +3,8 @@
 import itertools
 import time
 from collections.abc import Sequence
-from typing import Any, Literal
+from functools import partial
+from typing import Any, Literal, get_args
 from unittest import mock
 
 import jax
@@ -12,13 +13,9 @@ import jax.numpy as jnp
 from taic_jax.config import PPOConfig
 from taic_jax.envs.third_party import third_party
 
-PIPELINES: tuple[Literal["spring", "positional", "generalized", "mjx"], ...] = (
-    "spring",
-    "positional",
-    "generalized",
-    "mjx",
-)
+Pipeline = Literal["spring", "positional", "generalized", "mjx"]
 """Brax's engines, from the simplest physics to MuJoCo's."""
+PIPELINES: tuple[Pipeline, ...] = get_args(Pipeline)
 ITERATIONS = 3
 """After the first, which compiles."""
 
@@ -37,21 +34,17 @@ def ticks_per_second(name: str, pipeline: str, config: PPOConfig) -> list[float]
       DoesNotRunError: it raises, whatever it is: Brax's trainer is older than this JAX.
     """
     times = [time.perf_counter()]
-    ticks = config.num_envs * config.rollout_length
+    ticks, sizes = config.num_envs * config.rollout_length, tuple(config.hidden_sizes)
     minibatches = ticks // config.minibatch_size
     replicate = getattr(jax, "device_put_replicated", _replicated)
     with third_party(), mock.patch.object(jax, "device_put_replicated", replicate, create=True):
         from brax import envs
         from brax.training.agents.ppo import networks, train
 
-        sizes = tuple(config.hidden_sizes)
-
-        def make_networks(*args: Any, **settings: Any) -> Any:
-            return networks.make_ppo_networks(
-                *args, policy_hidden_layer_sizes=sizes, value_hidden_layer_sizes=sizes, activation=jax.nn.tanh,
-                **settings,
-            )  # fmt: skip
-
+        make_networks = partial(
+            networks.make_ppo_networks, policy_hidden_layer_sizes=sizes, value_hidden_layer_sizes=sizes,
+            activation=jax.nn.tanh,
+        )  # fmt: skip
         try:
             # Brax's batches are of environments: all their ticks at once. Each of its iterations is one rollout.
             train.train(
@@ -63,8 +56,8 @@ def ticks_per_second(name: str, pipeline: str, config: PPOConfig) -> list[float]
                 progress_fn=lambda *_: times.append(time.perf_counter()),
             )  # fmt: skip
         except Exception as error:
-            told = str(error).partition("\n")[0]
-            raise DoesNotRunError(f"does not run on jax {jax.__version__}: {type(error).__name__}: {told}") from error
+            first = str(error).partition("\n")[0]
+            raise DoesNotRunError(f"does not run on jax {jax.__version__}: {type(error).__name__}: {first}") from error
     return [ticks / (after - before) for before, after in itertools.pairwise(times[1:])]
 
 

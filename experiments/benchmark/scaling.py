@@ -1,34 +1,28 @@
-"""Where the time of an iteration goes, and how the time of a tick grows with what may grow by a factor of 16."""
+"""The parts of an iteration's time, and how the time of a tick grows with what may grow by a factor of 16."""
 
 import itertools
 import tempfile
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
 from taic_jax import envs
 from taic_jax.config import PPOConfig
-from taic_jax.experiments.loops import (
-    Training,
-    bare_engine,
-    has_engine,
-    learnt_executor,
-    options_config,
-    stepping,
-    untrained_rollout,
-    untrained_ticks,
-)
-from taic_jax.experiments.turns import Loop, take_turns
+from taic_jax.experiments.benchmark import loops
+from taic_jax.experiments.benchmark.command import Row
+from taic_jax.experiments.benchmark.loops import Training
+from taic_jax.experiments.benchmark.timing import Loop, interleave
 from taic_jax.options.execution import IdentityExecutor
 from taic_jax.runtime.checkpoint import Checkpoints
 
 FACTORS = (1, 4, 16)
 SMALLEST = {"environments": 16, "seeds": 1, "option length": 2, "observation size": 8}
+SAVED = 10
+"""Iterations in a call of `saving_loop`."""
 
 
 def shares(env: envs.Env, config: PPOConfig, rounds: int) -> dict[str, float]:
@@ -38,44 +32,31 @@ def shares(env: envs.Env, config: PPOConfig, rounds: int) -> dict[str, float]:
     jit, which hands arrays to the engine and adds rewards and resets; the rollout, which adds the policy; the
     iteration, which adds advantages and updates. All make the same number of ticks, the first three the very same ones.
     """
-    compiled, begin = untrained_rollout(env, config.num_envs, config.rollout_length)
-    actions = compiled(begin)[1].action
-    training, ticks = Training(env, IdentityExecutor(env.action_size), config), actions[..., 0].size
-    loops = [Loop("physics", bare_engine(env, actions), ticks)] if has_engine(env) else []
-    loops.append(Loop("transfer" if loops else "physics", stepping(env, actions), ticks))
-    loops.append(Loop("policy", lambda: jax.block_until_ready(compiled(begin)), ticks))
-    loops.append(Loop("update", training, ticks))
-    speeds = take_turns(loops, rounds)
-    taken, before = {}, 0.0
-    for name, speed in speeds.items():
-        taken[name], before = 1.0 / speed.median - before, 1.0 / speed.median
-    return {name: value / before for name, value in taken.items()}
+    policy = loops.untrained_rollout(env, config.num_envs, config.rollout_length)
+    actions, training = policy.run()[1].action, Training(env, IdentityExecutor(env.action_size), config)
+    engine = {"physics": loops.bare_engine(env, actions)} if loops.has_engine(env) else {}
+    task = {"transfer" if engine else "physics": loops.stepping(env, actions)}
+    speeds = interleave(engine | task | {"policy": policy, "update": training}, rounds)
+    times = [0.0, *(1.0 / speed.median for speed in speeds.values())]
+    return {name: (b - a) / times[-1] for name, (a, b) in zip(speeds, itertools.pairwise(times), strict=True)}
 
 
-class Saved:
-    """Iterations of training with a checkpoint after each, written while the next is computed, as a run has them.
+def saving_loop(training: Training, checkpoints: Checkpoints | None = None) -> Loop:
+    """Return ten iterations with a checkpoint after each, written while the next is computed, as a run has them.
 
-    Args:
-      training: makes the iterations.
-      folder: takes the checkpoints; without one, none are made.
+    The last checkpoint is waited for. Without checkpoints, none are made.
     """
+    steps = itertools.count(1)
 
-    ITERATIONS = 10
-    """A call's; the last checkpoint is waited for."""
+    def run() -> None:
+        for step in itertools.islice(steps, SAVED):
+            training()
+            if checkpoints:
+                checkpoints.save(step, training.state)
+        if checkpoints:
+            checkpoints.wait()
 
-    def __init__(self, training: Training, folder: Path | None = None):
-        self.ticks = self.ITERATIONS * training.ticks
-        self._training, self._count = training, itertools.count(1)
-        self._checkpoints = Checkpoints(folder) if folder else None
-
-    def __call__(self) -> None:
-        """Train for ten iterations more than before."""
-        for _ in range(self.ITERATIONS):
-            self._training()
-            if self._checkpoints:
-                self._checkpoints.save(next(self._count), self._training.state)
-        if self._checkpoints:
-            self._checkpoints.wait()
+    return Loop(run, SAVED * training.ticks)
 
 
 def saving(env: envs.Env, config: PPOConfig, counts: Sequence[int], rounds: int) -> dict[int, float]:
@@ -84,19 +65,14 @@ def saving(env: envs.Env, config: PPOConfig, counts: Sequence[int], rounds: int)
     for seeds in counts:
         training = Training(env, IdentityExecutor(env.action_size), config, seeds)
         with tempfile.TemporaryDirectory() as folder:
-            loops = {"without": Saved(training), "with": Saved(training, Path(folder))}
-            speeds = take_turns([Loop(name, loop, loop.ticks) for name, loop in loops.items()], rounds)
+            pair = {"without": saving_loop(training), "with": saving_loop(training, Checkpoints(Path(folder)))}
+            speeds = interleave(pair, rounds)
         shares[seeds] = speeds["without"].ratio(speeds["with"]) - 1.0
     return shares
 
 
 class Widened(envs.Wrapper):
-    """A task whose observation is followed by functions of it, up to a given size.
-
-    Args:
-      env: the task, of S entries.
-      size: of the observation, at least S.
-    """
+    """A task whose observation is followed by functions of it, up to a size of at least its own."""
 
     def __init__(self, env: envs.Env, size: int):
         super().__init__(env)
@@ -120,17 +96,7 @@ class Widened(envs.Wrapper):
         return state.replace(obs=jnp.concatenate([state.obs, entries]))
 
 
-@dataclass(frozen=True)
-class Cost:
-    """What a tick takes at one value of an axis, and the whole relative to growing in proportion from the first."""
-
-    axis: str
-    value: int
-    microseconds: float
-    of_linear: float
-
-
-def scaling(env: envs.Env, config: PPOConfig, steps: int, rounds: int) -> Iterator[Cost]:
+def scaling(env: envs.Env, config: PPOConfig, steps: int, rounds: int) -> Iterator[Row]:
     """Yield what a tick of training costs along each axis, the others fixed; `of_linear` above 1 is worse than linear.
 
     More environments or seeds make more ticks, so growing in proportion leaves the time of a tick as it is; longer
@@ -138,14 +104,11 @@ def scaling(env: envs.Env, config: PPOConfig, steps: int, rounds: int) -> Iterat
     """
     for axis, first in SMALLEST.items():
         values = [first * factor for factor in FACTORS]
-        loops = [_at(env, config, steps, axis, value) for value in values]
-        speeds = take_turns(
-            [Loop(str(value), loop, loop.ticks) for value, loop in zip(values, loops, strict=True)], rounds
-        )
-        for value in values:
+        speeds = interleave({str(value): _at(env, config, steps, axis, value) for value in values}, rounds)
+        for value, speed in zip(values, speeds.values(), strict=True):
             allowed = 1 if axis in ("environments", "seeds") else value / first
-            ratio = speeds[str(first)].ratio(speeds[str(value)])
-            yield Cost(axis, value, 1e6 / speeds[str(value)].median, ratio / allowed)
+            of_linear = speeds[str(first)].ratio(speed) / allowed
+            yield {"axis": axis, "value": value, "microseconds": 1e6 / speed.median, "of_linear": of_linear}
 
 
 def _at(env: envs.Env, config: PPOConfig, steps: int, axis: str, value: int) -> Training:
@@ -157,5 +120,4 @@ def _at(env: envs.Env, config: PPOConfig, steps: int, axis: str, value: int) -> 
         return Training(env, flat, config, value)
     if axis == "observation size":
         return Training(Widened(env, max(value, env.observation_size)), flat, config)
-    options = options_config("fixed", "open", steps, length=value)
-    return Training(env, learnt_executor(env, untrained_ticks(env), options), config)
+    return Training(env, loops.executor_of(env, loops.options_config("fixed", "open", steps, length=value)), config)
