@@ -22,13 +22,13 @@ BASE_MAP = np.array(
 )
 
 
-# What appears later (section 4.1, figure 4): a pocket behind the wall's lower gap. Who takes the shortest way is
-# caught 1.8 m behind that gap; only the upper one still leads to the goal.
+# It appears later (section 4.1, figure 4): a pocket behind the wall's lower gap. The shortest way ends 1.8 m behind
+# that gap; only the upper one still leads to the goal.
 TRAP = np.array([[7.0, 3.0, 7.4, 7.0], [5.2, 2.8, 7.4, 3.2], [5.2, 6.8, 7.4, 7.2]], np.float32)
 
 
 class NavigationState(struct.PyTreeNode):
-    """Where the point is, where it shall go, and how often it has tried."""
+    """The point's position and goal, and how often it has tried."""
 
     position: Array  # [2] m
     goal: Array  # [2] m
@@ -54,10 +54,7 @@ class Navigation(Env):
     dt = 0.2
 
     def __init__(
-        self,
-        walls: Float[Array | np.ndarray, "R 4"] = BASE_MAP,
-        random_ends: bool = False,
-        change_after: int = 0,
+        self, walls: Float[Array | np.ndarray, "R 4"] = BASE_MAP, random_ends: bool = False, change_after: int = 0
     ):
         self.name = "nav2d_random" if random_ends else "nav2d"
         self.observation_size = 4 if random_ends else 2
@@ -82,17 +79,8 @@ class Navigation(Env):
         position, goal = jnp.array(START), jnp.array(GOAL)
         if self.random_ends:
             position, goal = jax.vmap(self._free_point)(jax.random.uniform(key, (2, 3)))
-        physics = NavigationState(position=position, goal=goal, episode=episode)
-        no = jnp.zeros((), bool)
-        metrics = self._metrics(physics)
-        return State(
-            physics=physics,
-            obs=self._observe(physics),
-            reward=jnp.zeros(()),
-            terminated=no,
-            truncated=no,
-            metrics=metrics,
-        )
+        physics = NavigationState(position, goal, episode)
+        return State.first(physics, self._observe(physics), self._metrics(physics))
 
     def step(self, state: State, action: Float[Array, " 2"]) -> State:
         """Move by one tick, first along x, then along y."""
@@ -117,16 +105,10 @@ class Navigation(Env):
         """Draw room, obstacles, start, goal and the path so far."""
         from taic_jax.envs.rendering import render_room
 
+        standing = self._standing(np.asarray(physics.episode)[:, None])
+        longest_move = 1.01 * MAX_SPEED * self.dt
         return render_room(
-            np.asarray(self.walls),
-            np.asarray(self._standing(np.asarray(physics.episode)[:, None])),
-            physics.position,
-            physics.goal,
-            size=ROOM,
-            goal_radius=GOAL_RADIUS,
-            longest_move=1.01 * MAX_SPEED * self.dt,
-            height=height,
-            width=width,
+            self.walls, standing, physics.position, physics.goal, longest_move, height=height, width=width
         )
 
     def _observe(self, physics: NavigationState) -> Float[Array, " S"]:

@@ -15,6 +15,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image
 
 from taic_jax.envs.errors import RenderingError
+from taic_jax.envs.navigation import GOAL_RADIUS, ROOM
 
 Frames = UInt8[np.ndarray, "T height width 3"]
 
@@ -72,42 +73,39 @@ def _make_renderer(model: mujoco.MjModel, height: int, width: int) -> mujoco.Ren
 
 
 def render_room(
-    walls: Float[np.ndarray, "R 4"],
-    standing: Bool[np.ndarray, "T R"],
+    walls: Float[Array | np.ndarray, "R 4"],
+    standing: Bool[Array | np.ndarray, "T R"],
     position: Float[Array | np.ndarray, "T 2"],
     goal: Float[Array | np.ndarray, "T 2"],
-    *,
-    size: float,
-    goal_radius: float,
     longest_move: float,
+    *,
     height: int,
     width: int,
 ) -> Frames:
-    """Draw a point's way through the room [0, size]^2: obstacles, start, goal, and the episode's path so far.
+    """Draw a point's way through the room of `Navigation`: obstacles, start, goal, and the episode's path so far.
 
     `standing` says at which ticks a wall is there. A move longer than `longest_move` is a reset: there a new path
     starts.
     """
+    walls, standing, position, goal = (np.asarray(array) for array in (walls, standing, position, goal))
     dpi = height / 2.4  # lines and dots grow with the frame
     figure = matplotlib.figure.Figure(figsize=(width / dpi, height / dpi), dpi=dpi, facecolor="white")
     canvas = FigureCanvasAgg(figure)
-    axes = figure.add_axes((0.02, 0.02, 0.96, 0.96), xlim=(0, size), ylim=(0, size), aspect="equal")
+    axes = figure.add_axes((0.02, 0.02, 0.96, 0.96), xlim=(0, ROOM), ylim=(0, ROOM), aspect="equal")
     axes.set(xticks=[], yticks=[], facecolor=_FLOOR)
     for spine in axes.spines.values():
         spine.set(color=_WALL, linewidth=2)
     patches = [
-        matplotlib.patches.Rectangle((x, y), x_high - x, y_high - y, color=_WALL) for x, y, x_high, y_high in walls
+        axes.add_patch(matplotlib.patches.Rectangle((x, y), x_high - x, y_high - y, color=_WALL))
+        for x, y, x_high, y_high in walls
     ]
-    for patch in patches:
-        axes.add_patch(patch)
-    target = matplotlib.patches.Circle((0, 0), goal_radius, color=_GOAL, alpha=0.6, linewidth=0)
-    axes.add_patch(target)
+    target = axes.add_patch(matplotlib.patches.Circle((0, 0), GOAL_RADIUS, color=_GOAL, alpha=0.6, linewidth=0))
     (path,) = axes.plot([], [], color=_POINT, linewidth=1.5, alpha=0.7, solid_capstyle="round")
     (start,) = axes.plot([], [], "o", markersize=6, markerfacecolor="white", markeredgecolor=_POINT)
     (point,) = axes.plot([], [], "o", markersize=7, color=_POINT, markeredgecolor="white", clip_on=False)
     point.set_zorder(9)  # above the walls
 
-    position, goal, begin, frames = np.asarray(position), np.asarray(goal), 0, []
+    begin, frames = 0, []
     for t, here in enumerate(position):
         if np.abs(here - position[max(t - 1, 0)]).max() > longest_move:
             begin = t

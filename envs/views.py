@@ -1,4 +1,4 @@
-"""Views of a symmetric body: the same motion, told as another of its sides would see it."""
+"""Views of a symmetric body: the same motion, as another of its sides would see it."""
 
 import jax.numpy as jnp
 import numpy as np

@@ -1,4 +1,4 @@
-"""What an adapter asks of an environment before it lets it through, each refused in one line."""
+"""Conditions on an environment that passes an adapter, each refused in one line."""
 
 import contextlib
 from collections.abc import Iterator
@@ -30,8 +30,8 @@ def require_vector_actions(name: str, env: Any, limits: Float[np.ndarray, "A 2"]
 
     Args:
       name: the environment's, for the message.
-      env: any library's environment; its `action_space` is looked at where it has one.
-      limits: of every action, low and high; None if they are not known.
+      env: any library's environment; its `action_space` is read where it has one.
+      limits: of every action, low and high; None to take those of `action_space`.
 
     Raises:
       AdapterError: the actions are discrete, composite or without limits.
@@ -73,9 +73,3 @@ def require_task(adapter: str, env: Any) -> State:
     if start.key is not None:
         raise AdapterError(f"{adapter}: {env.name} is in AutoReset, expected the environment inside it")
     return start
-
-
-def strong(tree: Any) -> Any:
-    """Make every dtype strong, for a carry that is the same after reset and step."""
-    arrays = jax.tree.map(jax.numpy.asarray, tree)
-    return jax.tree.map(lambda leaf: jax.lax.convert_element_type(leaf, leaf.dtype), arrays)

@@ -1,13 +1,17 @@
 """Physics as a pure function of a small state, on interchangeable backends."""
 
+from typing import TYPE_CHECKING
+
 import jax
 from mujoco import MjModel
 
 from taic_jax.envs.errors import UnknownNameError
-from taic_jax.envs.physics.base import Physics
 from taic_jax.envs.physics.mujoco import MujocoPhysics
 
-__all__ = ["BACKENDS", "MujocoPhysics", "Physics", "make_physics"]
+if TYPE_CHECKING:
+    from taic_jax.envs.physics.mjx import MjxPhysics
+
+__all__ = ["BACKENDS", "MujocoPhysics", "make_physics"]
 
 BACKENDS = ("auto", "mujoco", "mjx", "warp")
 
@@ -20,7 +24,7 @@ def make_physics(
     *,
     iterations: int | None = None,
     ls_iterations: int | None = None,
-) -> Physics:
+) -> "MujocoPhysics | MjxPhysics":
     """Load a model on a backend.
 
     Args:
@@ -28,7 +32,7 @@ def make_physics(
       substeps: engine steps a tick.
       backend: `mujoco` (C engine, host's cores), `mjx` (JAX), `warp` (MJX on MuJoCo Warp, NVIDIA only), or `auto`:
         `mujoco` where JAX runs on CPU, else `mjx`.
-      num_threads: threads of the `mujoco` backend; 0 takes one per physical core.
+      num_threads: threads of the `mujoco` backend; 0 shares the physical cores between JAX's devices.
       iterations: solver iterations on `mjx` and `warp`, None for the model's own.
       ls_iterations: line-search iterations likewise.
 

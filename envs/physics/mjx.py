@@ -9,7 +9,6 @@ from jaxtyping import Float
 
 from taic_jax.envs.base import PhysicsState
 from taic_jax.envs.errors import BackendError, MissingExtraError
-from taic_jax.envs.physics.base import Physics
 from taic_jax.envs.third_party import third_party
 
 with third_party():
@@ -21,16 +20,12 @@ with third_party():
 _WARP_CAPACITY = {"naconmax": 32 * 8192, "njmax": 200}
 
 
-class MjxPhysics(Physics):
+class MjxPhysics:
     """Steps of MJX on a template `mjx.Data`, of which only `PhysicsState` and the controls change.
 
-    Args:
-      model: compiled model.
-      substeps: engine steps a tick.
-      iterations: solver iterations instead of the model's. Fewer are faster and soon wrong: with a single
-        one, the ant's joint velocities are off by 10 rad/s within a tick.
-      ls_iterations: line-search iterations instead of the model's; 4 change nothing measurable.
-      warp: let MuJoCo Warp compute the steps.
+    Fewer solver iterations are faster and soon wrong: with a single one, the ant's joint velocities are off by
+    10 rad/s within a tick. Of the line search, 4 iterations change nothing measurable. For the arguments see
+    `make_physics`.
 
     Raises:
       MissingExtraError: for `warp`, its package is not installed or JAX has no NVIDIA device.
@@ -45,10 +40,9 @@ class MjxPhysics(Physics):
         *,
         warp: bool = False,
     ):
-        super().__init__(model, substeps)
         if warp:
             _require_warp()
-        impl = "warp" if warp else "jax"
+        self.model, self.substeps, impl = model, substeps, "warp" if warp else "jax"
         with third_party():
             mjx_model = mjx.put_model(model, impl=impl)
             option = mjx_model.opt.replace(
@@ -61,7 +55,7 @@ class MjxPhysics(Physics):
             self._data = mjx.make_data(model, impl=impl, **(_WARP_CAPACITY if warp else {}))
 
     def step(self, state: PhysicsState, ctrl: Float[Array, " nu"]) -> PhysicsState:
-        """Advance by one tick under constant controls."""
+        """Advance by one tick, i.e. all its substeps, under constant controls."""
 
         def substep(state: PhysicsState, _: None) -> tuple[PhysicsState, None]:
             data = self._data.replace(qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.qacc_warmstart, ctrl=ctrl)
@@ -79,4 +73,4 @@ def _require_warp() -> None:
         raise BackendError("warp", f"an NVIDIA GPU, and JAX runs on {jax.default_backend()}")
     import warp
 
-    warp.config.log_level = warp.LOG_WARNING  # below, it tells of each kernel that it loads
+    warp.config.log_level = warp.LOG_WARNING  # below, it prints a line for each kernel that it loads

@@ -15,44 +15,30 @@ from jax import Array
 from jaxtyping import Float
 
 from taic_jax.envs.base import PhysicsState
-from taic_jax.envs.physics.base import Physics
 from taic_jax.envs.physics.host_call import HostCall, host_calls_work
 from taic_jax.envs.physics.watchdog import Watchdog
 
-# What a call sends, in the order of MuJoCo's state rows, where only the time precedes it.
-_SENT = (
-    mujoco.mjtState.mjSTATE_QPOS.value
-    | mujoco.mjtState.mjSTATE_QVEL.value
-    | mujoco.mjtState.mjSTATE_WARMSTART.value
-    | mujoco.mjtState.mjSTATE_CTRL.value
-)
+# Contents of a call, in the order of MuJoCo's state rows, where only the time precedes it.
+_STATE, _WARNING = mujoco.mjtState, mujoco.mjtWarning
+_SENT = sum(x.value for x in (_STATE.mjSTATE_QPOS, _STATE.mjSTATE_QVEL, _STATE.mjSTATE_WARMSTART, _STATE.mjSTATE_CTRL))
 # After these warnings MuJoCo has put the simulation back to its initial pose.
-_DIVERGED = [
-    mujoco.mjtWarning.mjWARN_BADQPOS.value,
-    mujoco.mjtWarning.mjWARN_BADQVEL.value,
-    mujoco.mjtWarning.mjWARN_BADQACC.value,
-]
+_DIVERGED = [x.value for x in (_WARNING.mjWARN_BADQPOS, _WARNING.mjWARN_BADQVEL, _WARNING.mjWARN_BADQACC)]
 PATIENCE = 60.0
-"""Seconds after which a call that has not returned is told; the longest of ours take a tenth of one."""
+"""Seconds after which a call that has not returned is reported; the longest of ours take a tenth of one."""
 LATE = (
     f"the physics has not returned for {PATIENCE:.0f} s. If it never does: end the process (kill -9), go on from the "
     "last checkpoint (--resume), and should it happen again, step with one thread (--env.num-threads 1)"
 )
 
 
-class MujocoPhysics(Physics):
+class MujocoPhysics:
     """A host call of `mujoco.batch.Batch`; all leading axes (seeds, environments) are one engine call.
 
-    It is pure: what the engine keeps between calls is scratch. Each call overwrites every state field that
+    It is pure: the engine's own memory between calls is scratch. Each call overwrites every state field that
     `mj_step` reads (qpos, qvel, qacc_warmstart, ctrl). The others never change: models with activations,
     mocap bodies, plugins or equalities are refused, no forces are applied, and the time enters no force. So
     the result depends on the arguments alone, at any number of threads. A simulation that diverges comes back
-    as NaN.
-
-    Args:
-      model: compiled model; what changes in it later has no effect.
-      substeps: engine steps a tick.
-      num_threads: threads that step simulations; 0 shares the physical cores between JAX's devices.
+    as NaN. Later changes of the model have no effect. For the arguments see `make_physics`.
 
     Raises:
       ValueError: if the model has state that `PhysicsState` does not carry.
@@ -61,12 +47,12 @@ class MujocoPhysics(Physics):
     def __init__(self, model: mujoco.MjModel, substeps: int, num_threads: int = 0):
         if model.na or model.nhistory or model.nmocap or model.nplugin or model.neq:
             raise ValueError("the model must have no activations, mocap bodies, plugins or equalities")
-        super().__init__(model, substeps)
+        self.model, self.substeps = model, substeps
         self.num_threads = num_threads or max(1, num_physical_cores() // jax.local_device_count())
         self.engine = _engine(_as_bytes(model), substeps, self.num_threads)
 
     def step(self, state: PhysicsState, ctrl: Float[Array, " nu"]) -> PhysicsState:
-        """Advance by one tick under constant controls."""
+        """Advance by one tick, i.e. all its substeps, under constant controls."""
         nq, nv = self.model.nq, self.model.nv
         sent = jnp.concatenate([state.qpos, state.qvel, state.qacc_warmstart, ctrl])
         here = self._step_elsewhere if self.engine.call is None else self._step_here
@@ -85,13 +71,9 @@ class MujocoPhysics(Physics):
 
 
 class Engine:
-    """What steps a model's simulations on the host: any number in one call, in any number of threads at once.
+    """Steps of a model's simulations on the host: any number in one call, and calls from any number of threads.
 
-    Args:
-      name: of its host call; no other engine has it.
-      model: its own.
-      substeps: engine steps a tick.
-      num_threads: of each call.
+    No other engine's host call has its name, and nothing else changes its model.
     """
 
     def __init__(self, name: str, model: mujoco.MjModel, substeps: int, num_threads: int):

@@ -20,7 +20,7 @@ from ml_collections import ConfigDict
 
 from taic_jax.envs.adapters import BraxEnv, PlaygroundEnv, to_brax
 from taic_jax.envs.adapters.admission import require_task, require_vector_actions, require_vector_obs
-from taic_jax.envs.adapters.playground import PlaygroundPhysics
+from taic_jax.envs.adapters.foreign import ForeignPhysics
 from taic_jax.envs.contract import check_contract
 from taic_jax.envs.errors import AdapterError, MissingExtraError
 from taic_jax.envs.third_party import third_party
@@ -46,7 +46,7 @@ def test_adapter_is_braxs_own_step():
     np.testing.assert_array_equal(ours.obs, expected.obs)
     np.testing.assert_array_equal(ours.reward, expected.reward)
     np.testing.assert_array_equal(ours.terminated, expected.done.astype(bool))
-    np.testing.assert_array_equal(ours.physics.pipeline_state.q, expected.pipeline_state.q)
+    np.testing.assert_array_equal(ours.physics.simulation.q, expected.pipeline_state.q)
     assert ours.terminated.any() and not ours.truncated.any()
     assert env.episode_length == 1000 and env.dt == 0.02
 
@@ -206,7 +206,7 @@ def test_playground_adapter_is_playgrounds_own_step(playground):
     np.testing.assert_array_equal(ours.obs, expected.obs)
     np.testing.assert_array_equal(ours.reward, expected.reward)
     np.testing.assert_array_equal(ours.terminated, expected.done.astype(bool))
-    np.testing.assert_array_equal(ours.physics.data.qpos, expected.data.qpos)
+    np.testing.assert_array_equal(ours.physics.simulation.qpos, expected.data.qpos)
     assert (env.name, env.action_size, env.episode_length, env.dt) == ("playground:PendulumSwingup", 1, 1000, 0.02)
     assert env.observation_size == env.proprioceptive_size == 3
     check_contract(env)
@@ -264,7 +264,7 @@ def test_pictures_show_where_playgrounds_targets_are(monkeypatch, playground):
     places[2] = [[0.3, 0.0, 0.0]]
     data = SimpleNamespace(qpos=np.zeros((3, 1)), mocap_pos=places)
     try:
-        frames = PlaygroundEnv("Parts").render(PlaygroundPhysics(data, {}, {}), height=60, width=80)
+        frames = PlaygroundEnv("Parts").render(ForeignPhysics(data, {}, {}), height=60, width=80)
     except RenderingError as error:
         pytest.skip(str(error))
     assert frames.shape == (3, 60, 80, 3) and frames.dtype == np.uint8
