@@ -14,6 +14,7 @@ from taic_jax.envs.arenas import ANT_QPOS, ANT_QVEL, Arena, furnish
 from taic_jax.envs.base import PhysicsState, State
 from taic_jax.envs.errors import UnknownNameError
 from taic_jax.envs.locomotion import Judgement, Locomotion
+from taic_jax.envs.rendering import render_mujoco
 from taic_jax.envs.robots import ROBOTS, compile_spec, initial_qpos, load_spec, with_body
 
 SUCCESS_RADIUS = 5.0  # m, of HIRO
@@ -109,8 +110,6 @@ class AntArena(Locomotion):
 
     def render(self, physics: ArenaState, *, height: int = 240, width: int = 320) -> np.ndarray:
         """Draw the arena with MuJoCo's renderer, from above."""
-        from taic_jax.envs.rendering import render_mujoco
-
         goal = np.asarray(physics.goal)
         if goal.shape[1] == 2:
             goal = np.concatenate([goal, np.full((len(goal), 1), 0.5, goal.dtype)], axis=1)

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Key
 
 from taic_jax.envs.base import Env, PhysicsState, State
 from taic_jax.envs.physics import make_physics
+from taic_jax.envs.rendering import render_mujoco
 from taic_jax.envs.robots import Robot, compile_spec, initial_qpos, load_spec
 from taic_jax.envs.views import Views, make_views
 
@@ -79,8 +80,6 @@ class Locomotion(Env):
 
     def render(self, physics: PhysicsState, *, height: int = 240, width: int = 320) -> np.ndarray:
         """Draw with MuJoCo's renderer, from the tracking camera."""
-        from taic_jax.envs.rendering import render_mujoco
-
         return render_mujoco(self.model, physics.qpos, height=height, width=width)
 
     def _make_model(self) -> mujoco.MjModel:

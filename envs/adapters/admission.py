@@ -47,18 +47,6 @@ def require_vector_actions(name: str, env: Any, limits: Float[np.ndarray, "A 2"]
         raise AdapterError(f"{name}: actions: action {index} is in [{low}, {high}], expected finite limits")
 
 
-def require_vector_obs(name: str, obs: Any) -> int:
-    """Return the length of an abstract observation.
-
-    Raises:
-      AdapterError: it is not one vector.
-    """
-    if len(getattr(obs, "shape", ())) != 1:
-        shapes = jax.tree.map(lambda leaf: leaf.shape, obs)
-        raise AdapterError(f"{name}: obs: got the shapes {shapes}, expected one vector [S]")
-    return obs.shape[0]
-
-
 def require_task(adapter: str, env: Any) -> State:
     """Return the abstract first state of one of our environments that shall leave through an adapter.
 

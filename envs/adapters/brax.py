@@ -6,6 +6,7 @@ import numpy as np
 
 from taic_jax.envs.adapters.foreign import ForeignEnv, ForeignPhysics
 from taic_jax.envs.errors import AdapterError, UnknownNameError
+from taic_jax.envs.rendering import render_mujoco
 from taic_jax.envs.third_party import third_party
 
 BRAX_PREFIX = "brax:"
@@ -45,6 +46,4 @@ class BraxEnv(ForeignEnv):
 
     def render(self, physics: ForeignPhysics, *, height: int = 240, width: int = 320) -> np.ndarray:
         """Draw with MuJoCo's renderer, from Brax's generalised positions."""
-        from taic_jax.envs.rendering import render_mujoco
-
         return render_mujoco(self.inner.sys.mj_model, physics.simulation.q, height=height, width=width)

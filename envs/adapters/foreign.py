@@ -10,8 +10,9 @@ from flax import struct
 from jax import Array
 from jaxtyping import Float, Key
 
-from taic_jax.envs.adapters.admission import require_vector_actions, require_vector_obs
+from taic_jax.envs.adapters.admission import require_vector_actions
 from taic_jax.envs.base import Env, State
+from taic_jax.envs.errors import AdapterError
 from taic_jax.envs.third_party import third_party
 
 
@@ -46,7 +47,10 @@ class ForeignEnv(Env):
         self._state_type = type(start)
         self._in_parts = isinstance(start.obs, Mapping)
         obs = start.obs.get("state", start.obs) if self._in_parts else start.obs
-        self.observation_size = self.proprioceptive_size = require_vector_obs(name, obs)
+        if len(getattr(obs, "shape", ())) != 1:
+            shapes = jax.tree.map(lambda leaf: leaf.shape, obs)
+            raise AdapterError(f"{name}: obs: got the shapes {shapes}, expected one vector [S]")
+        self.observation_size = self.proprioceptive_size = obs.shape[0]
         self.action_size = int(inner.action_size)
         self.dt = float(getattr(inner, "dt", 1.0))  # `fast`, a test of Brax's own, has no clock
 

@@ -45,10 +45,8 @@ class _Export:
     def _advance(self, action: np.ndarray) -> tuple[Any, ...]:
         """Make one tick; return obs, reward, terminated, truncated and metrics as arrays of the caller's own."""
         before, action = self._present(), np.asarray(action, np.float32)
-        if action.shape != self.action_space.shape:
-            raise AdapterError(
-                f"{self.env.name}: action: got the shape {action.shape}, expected {self.action_space.shape}"
-            )
+        if action.shape != (shape := self.action_space.shape):
+            raise AdapterError(f"{self.env.name}: action: got the shape {action.shape}, expected {shape}")
         self._state = state = self._step(before, action)
         outputs = state.obs, state.reward, state.terminated, state.truncated, state.metrics
         return jax.tree.map(np.array, jax.device_get(outputs))
@@ -80,12 +78,7 @@ class GymnasiumExport(_Export, gymnasium.Env[np.ndarray, np.ndarray]):
         return np.array(state.obs), _floats(state.metrics)
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Make one tick under an action [A].
-
-        Raises:
-          AdapterError: the action has another shape.
-          ResetNeeded: there was no reset.
-        """
+        """Make one tick under an action [A]; `AdapterError` at another shape, `ResetNeeded` before a reset."""
         obs, reward, terminated, truncated, metrics = self._advance(action)
         return obs, float(reward), bool(terminated), bool(truncated), _floats(metrics)
 
@@ -112,24 +105,17 @@ class GymnasiumVectorExport(_Export, gymnasium.vector.VectorEnv[np.ndarray, np.n
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
         """Start a task's first episode in every copy; return obs [N, S] float32 and the metrics [N] with their masks.
 
-        Raises:
-          AdapterError: only some copies shall start anew, which happens by itself here.
+        There is no `reset_mask`: `AdapterError` where one is in the options.
         """
         if options and "reset_mask" in options:
-            raise AdapterError(
-                f"{self.env.name}: reset_mask: got one, expected none: ended episodes restart by themselves"
-            )
+            problem = "reset_mask: got one, expected none: ended episodes restart by themselves"
+            raise AdapterError(f"{self.env.name}: {problem}")
         super().reset(seed=seed)
         self._state = state = self._reset(jax.random.split(_draw_key(self.np_random), self.num_envs))
         return np.array(state.obs), _masked(jax.device_get(state.metrics), np.ones(self.num_envs, bool))
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Make one tick in every copy under actions [N, A]; where an episode ends, the next one starts.
-
-        Raises:
-          AdapterError: the actions have another shape.
-          ResetNeeded: there was no reset.
-        """
+        """Make one tick in every copy under actions [N, A], with the same errors; an end starts the next episode."""
         obs, reward, terminated, truncated, metrics = self._advance(actions)
         ended = terminated | truncated
         infos: dict[str, Any] = _masked(metrics, ~ended)  # a start that happens in this tick has no metrics

@@ -12,6 +12,7 @@ from jaxtyping import Key
 from taic_jax.envs.adapters.admission import extra
 from taic_jax.envs.adapters.foreign import ForeignEnv, ForeignPhysics
 from taic_jax.envs.errors import AdapterError, UnknownNameError
+from taic_jax.envs.rendering import render_mujoco
 from taic_jax.envs.third_party import third_party
 
 PLAYGROUND_PREFIX = "playground:"
@@ -54,8 +55,6 @@ class PlaygroundEnv(ForeignEnv):
 
     def render(self, physics: ForeignPhysics, *, height: int = 240, width: int = 320) -> np.ndarray:
         """Draw with MuJoCo's renderer, from qpos and from where the targets (mocap bodies) are."""
-        from taic_jax.envs.rendering import render_mujoco
-
         model, data = self.inner.mj_model, physics.simulation
         qpos, mocap = np.asarray(data.qpos), np.asarray(data.mocap_pos)
         bounds = np.flatnonzero((mocap[1:] != mocap[:-1]).any(axis=(1, 2))) + 1

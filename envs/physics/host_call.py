@@ -127,7 +127,7 @@ def _array(buffers: int) -> np.ndarray:
 
 
 def _as_error(api: int, message: str) -> int:
-    """Have XLA make an error with that message."""
+    """Return an error of XLA's with that message."""
     text = ctypes.c_char_p(message.encode())
     arguments = (ctypes.c_int64 * 4)(32, 0, ctypes.cast(text, ctypes.c_void_p).value or 0, _INTERNAL)
     return _Handler(_words(api, _CREATE_ERROR + 1)[_CREATE_ERROR])(ctypes.addressof(arguments)) or 0

@@ -49,7 +49,9 @@ class MujocoPhysics:
             raise ValueError("the model must have no activations, mocap bodies, plugins or equalities")
         self.model, self.substeps = model, substeps
         self.num_threads = num_threads or max(1, num_physical_cores() // jax.local_device_count())
-        self.engine = _engine(_as_bytes(model), substeps, self.num_threads)
+        saved = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+        mujoco.mj_saveModel(model, None, saved)
+        self.engine = _engine(saved.tobytes(), substeps, self.num_threads)
 
     def step(self, state: PhysicsState, ctrl: Float[Array, " nu"]) -> PhysicsState:
         """Advance by one tick, i.e. all its substeps, under constant controls."""
@@ -116,12 +118,6 @@ def _engine(model: bytes, substeps: int, num_threads: int) -> Engine:
     digest = hashlib.sha256(model).hexdigest()[:16]
     loaded = mujoco.MjModel.from_binary_path("model.mjb", {"model.mjb": model})
     return Engine(f"taic_jax_mujoco_{digest}_{substeps}_{num_threads}", loaded, substeps, num_threads)
-
-
-def _as_bytes(model: mujoco.MjModel) -> bytes:
-    saved = np.empty(mujoco.mj_sizeModel(model), np.uint8)
-    mujoco.mj_saveModel(model, None, saved)
-    return saved.tobytes()
 
 
 def num_physical_cores() -> int:

@@ -19,7 +19,7 @@ from brax import envs as brax_envs
 from ml_collections import ConfigDict
 
 from taic_jax.envs.adapters import BraxEnv, PlaygroundEnv, to_brax
-from taic_jax.envs.adapters.admission import require_task, require_vector_actions, require_vector_obs
+from taic_jax.envs.adapters.admission import require_task, require_vector_actions
 from taic_jax.envs.adapters.foreign import ForeignPhysics
 from taic_jax.envs.contract import check_contract
 from taic_jax.envs.errors import AdapterError, MissingExtraError
@@ -146,9 +146,7 @@ REFUSALS = {
     "here: actions: action 0 is in [-inf, inf], expected finite limits": lambda: require_vector_actions(
         "here", ENDLESS
     ),
-    "here: obs: got the shapes {'a': (2,)}, expected one vector [S]": lambda: require_vector_obs(
-        "here", {"a": jnp.zeros(2)}
-    ),
+    "brax:parts: obs: got the shapes {'a': (2,)}, expected one vector [S]": lambda: BraxEnv("parts"),
     "brax:swimmer: the pipeline 'spring' does not fit: Unsupported backend: spring.": lambda: BraxEnv("swimmer"),
     "brax:dice: actions: got Discrete(6), expected one vector of numbers with limits": lambda: BraxEnv("dice"),
     "brax:free: actions: action 1 is in [-inf, 1.0], expected finite limits": lambda: BraxEnv("free"),
@@ -161,6 +159,8 @@ def test_what_does_not_fit_is_told_in_one_line(message, monkeypatch):
     free = SimpleNamespace(sys=SimpleNamespace(actuator=actuator))
     monkeypatch.setitem(brax_envs._envs, "dice", lambda backend: DISCRETE)
     monkeypatch.setitem(brax_envs._envs, "free", lambda backend: free)
+    start = brax_envs.State(None, {"a": jnp.zeros(2)}, jnp.zeros(()), jnp.zeros(()))
+    monkeypatch.setitem(brax_envs._envs, "parts", lambda backend: SimpleNamespace(reset=lambda key: start))
     with pytest.raises(AdapterError) as caught:
         REFUSALS[message]()
     assert str(caught.value) == message
