@@ -68,11 +68,7 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 def parse(args: Sequence[str]) -> Arguments:
-    """Parse the arguments.
-
-    Raises:
-      ArgumentError: an argument is not valid.
-    """
+    """Parse the arguments; `ArgumentError` where one is not valid."""
     try:
         with contextlib.redirect_stderr(io.StringIO()):
             arguments = tyro.cli(Arguments, prog=PROGRAM, args=args)
@@ -118,8 +114,7 @@ def draw(arguments: Arguments) -> None:
 def random_episodes(env: Env, key: Key[Array, ""], ticks: int) -> State:
     """Act at random but smoothly, with automatic resets; return the states after each tick, leading axis T.
 
-    The actions are white noise through a first-order filter: as the body is slow, it would average white
-    noise away and hardly move.
+    The actions are white noise through a first-order filter: a slow body would average white noise away.
     """
     env, keep = AutoReset(env), math.exp(-1.0 / MEMORY)
     key_reset, key_start, key_noise = jax.random.split(key, 3)

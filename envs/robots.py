@@ -122,11 +122,7 @@ ROBOTS: dict[str, dict[str, Robot]] = {
 
 
 def with_body(ant: Robot, body: str) -> Robot:
-    """Return the ant with the body of `gym`, as it is; or of `hiro`, with a fifth of its strength and longer ticks.
-
-    Raises:
-      UnknownNameError: there is no such body.
-    """
+    """Return the ant with the body of `gym`, as it is; or of `hiro`, with a fifth of its strength and longer ticks."""
     if body not in BODIES:
         raise UnknownNameError("body", body, BODIES)
     if body == "gym":
@@ -143,11 +139,7 @@ def with_body(ant: Robot, body: str) -> Robot:
 
 
 def load_spec(robot: Robot) -> mujoco.MjSpec:
-    """Read the robot's MJCF from the package that ships it, without importing that (which is slow).
-
-    Raises:
-      MissingExtraError: the package is not installed.
-    """
+    """Read the MJCF from the package that ships it, or raise `MissingExtraError`; importing that would be slow."""
     package, path = robot.mjcf
     module = importlib.util.find_spec(package)
     if module is None or module.origin is None:

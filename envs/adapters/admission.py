@@ -14,11 +14,7 @@ from taic_jax.envs.errors import AdapterError, MissingExtraError
 
 @contextlib.contextmanager
 def extra(name: str) -> Iterator[None]:
-    """Import packages of an extra of ours.
-
-    Raises:
-      MissingExtraError: one of them is not installed; the message gives the line that installs it.
-    """
+    """Import packages of an extra of ours; `MissingExtraError` with the line that installs it where one is missing."""
     try:
         yield
     except ModuleNotFoundError as error:
@@ -26,15 +22,9 @@ def extra(name: str) -> Iterator[None]:
 
 
 def require_vector_actions(name: str, env: Any, limits: Float[np.ndarray, "A 2"] | None = None) -> None:
-    """Refuse actions that a vector in [-1, 1]^A cannot stand for.
+    """Raise `AdapterError` at actions that a vector in [-1, 1]^A cannot stand for: discrete, composite or unlimited.
 
-    Args:
-      name: the environment's, for the message.
-      env: any library's environment; its `action_space` is read where it has one.
-      limits: of every action, low and high; None to take those of `action_space`.
-
-    Raises:
-      AdapterError: the actions are discrete, composite or without limits.
+    `limits` are low and high of every action; without them, those of the environment's `action_space` are read.
     """
     space: Any = getattr(env, "action_space", None)
     if any(hasattr(space, attribute) for attribute in ("n", "nvec", "spaces")):
@@ -50,8 +40,7 @@ def require_vector_actions(name: str, env: Any, limits: Float[np.ndarray, "A 2"]
 def require_task(adapter: str, env: Any) -> State:
     """Return the abstract first state of one of our environments that shall leave through an adapter.
 
-    Raises:
-      AdapterError: it is none of ours, or starts the next episode by itself, which the other side does.
+    Raise `AdapterError` if it is none of ours, or starts the next episode by itself, which the other side does.
     """
     require_vector_actions(adapter, env)
     if not isinstance(env, Env):

@@ -27,13 +27,8 @@ class ForeignPhysics(struct.PyTreeNode):
 class ForeignEnv(Env):
     """An environment of such a library; its `done` is our `terminated`, and the time limit is ours.
 
-    Of an observation in parts, the one named "state" is taken.
-
-    Args:
-      name: ours, with the library's prefix.
-      inner: the library's environment.
-      simulation: the field of its state that becomes `ForeignPhysics.simulation`.
-      limits: of every action, low and high; None if the library names none.
+    Of an observation in parts, the one named "state" is taken. `simulation` names the field of the library's state that
+    becomes `ForeignPhysics.simulation`; `limits` are low and high of every action, None if the library has none.
 
     Raises:
       AdapterError: the observation is not one vector, or actions have no limits.

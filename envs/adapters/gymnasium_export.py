@@ -21,21 +21,12 @@ RENDER_MODES = ("rgb_array",)
 
 
 class _Export:
-    """The common part of both exports: admission, and an environment's state between calls."""
+    """The common part of both exports: an environment's state between calls."""
 
     env: Env
     action_space: Any
-    render_mode: str | None
-    metadata: dict[str, Any]
     _step: Callable[[State, np.ndarray], State]
     _state: State | None = None
-
-    def _admit(self, adapter: str, env: Env, render_mode: str | None) -> None:
-        require_task(adapter, env)
-        if render_mode not in (None, *RENDER_MODES):
-            raise UnknownNameError("render mode", str(render_mode), RENDER_MODES)
-        self.render_mode = render_mode
-        self.metadata = {"render_modes": list(RENDER_MODES), "render_fps": 1.0 / env.dt}
 
     def _present(self) -> State:
         if self._state is None:
@@ -56,8 +47,8 @@ class GymnasiumExport(_Export, gymnasium.Env[np.ndarray, np.ndarray]):
     """An environment of ours as a `gymnasium.Env` (see `to_gymnasium`); actions are clipped to [-1, 1]."""
 
     def __init__(self, env: Env, render_mode: str | None = None):
-        self._admit("to_gymnasium", env, render_mode)
-        self.env = env
+        self.metadata = _admit("to_gymnasium", env, render_mode)
+        self.env, self.render_mode = env, render_mode
         self.observation_space, self.action_space = _spaces(env)
         # With a spec, Gymnasium's checker also tries the render modes and that seeds repeat an episode. Copies of the
         # spec share a closure, unlike the arguments of a partial.
@@ -91,11 +82,10 @@ class GymnasiumVectorExport(_Export, gymnasium.vector.VectorEnv[np.ndarray, np.n
     """N copies of an environment of ours as a `gymnasium.vector.VectorEnv` (see `to_gymnasium_vector`)."""
 
     def __init__(self, env: Env, num_envs: int, render_mode: str | None = None):
-        self._admit("to_gymnasium_vector", env, render_mode)
+        self.metadata = _admit("to_gymnasium_vector", env, render_mode)
         if isinstance(num_envs, bool) or not isinstance(num_envs, int) or num_envs < 1:
             raise AdapterError(f"to_gymnasium_vector: num_envs: got {num_envs!r}, expected an integer of at least 1")
-        self.env = AutoReset(env)
-        self.num_envs = num_envs
+        self.env, self.num_envs, self.render_mode = AutoReset(env), num_envs, render_mode
         self.metadata["autoreset_mode"] = gymnasium.vector.AutoresetMode.SAME_STEP
         self.single_observation_space, self.single_action_space = _spaces(env)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -133,6 +123,14 @@ class GymnasiumVectorExport(_Export, gymnasium.vector.VectorEnv[np.ndarray, np.n
             return None
         physics = self._present().physics
         return tuple(_frame(self.env, jax.tree.map(lambda leaf, i=i: leaf[i], physics)) for i in range(self.num_envs))
+
+
+def _admit(adapter: str, env: Env, render_mode: str | None) -> dict[str, Any]:
+    """Refuse an environment that is not one of ours, or an unknown render mode; return the metadata."""
+    require_task(adapter, env)
+    if render_mode not in (None, *RENDER_MODES):
+        raise UnknownNameError("render mode", str(render_mode), RENDER_MODES)
+    return {"render_modes": list(RENDER_MODES), "render_fps": 1.0 / env.dt}
 
 
 def _spaces(env: Env) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:

@@ -57,19 +57,14 @@ class MujocoPhysics:
         """Advance by one tick, i.e. all its substeps, under constant controls."""
         nq, nv = self.model.nq, self.model.nv
         sent = jnp.concatenate([state.qpos, state.qvel, state.qacc_warmstart, ctrl])
-        here = self._step_elsewhere if self.engine.call is None else self._step_here
-        after = jax.lax.platform_dependent(sent, cpu=here, default=self._step_elsewhere)
-        return state.replace(qpos=after[:nq], qvel=after[nq : nq + nv], qacc_warmstart=after[nq + nv :])
-
-    def _step_here(self, sent: Float[Array, " n"]) -> Float[Array, " m"]:
-        """Step in XLA's own memory: on CPU, where `pure_callback` takes ten times as long to hand arrays over."""
-        assert self.engine.call is not None
-        return self.engine.call(sent, self.engine.num_returned)
-
-    def _step_elsewhere(self, sent: Float[Array, " n"]) -> Float[Array, " m"]:
-        """Step simulations whose state comes from an accelerator, or where XLA refuses our host calls."""
+        # `pure_callback` serves accelerators and an XLA that refuses our host calls. On CPU it takes ten times as long
+        # to hand arrays over as a host call, which steps in XLA's own memory.
         shape = jax.ShapeDtypeStruct((self.engine.num_returned,), jnp.float32)
-        return jax.pure_callback(self.engine.copied_step, shape, sent, vmap_method="broadcast_all")
+        elsewhere = functools.partial(jax.pure_callback, self.engine.copied_step, shape, vmap_method="broadcast_all")
+        call = self.engine.call
+        here = elsewhere if call is None else functools.partial(call, size=self.engine.num_returned)
+        after = jax.lax.platform_dependent(sent, cpu=here, default=elsewhere)
+        return state.replace(qpos=after[:nq], qvel=after[nq : nq + nv], qacc_warmstart=after[nq + nv :])
 
 
 class Engine:
