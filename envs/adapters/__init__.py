@@ -13,14 +13,8 @@ if TYPE_CHECKING:
     from taic_jax.envs.adapters.gymnasium_export import GymnasiumExport, GymnasiumVectorExport
 
 __all__ = [
-    "BRAX_PREFIX",
-    "PLAYGROUND_PREFIX",
-    "BraxEnv",
-    "PlaygroundEnv",
-    "to_brax",
-    "to_gymnasium",
-    "to_gymnasium_vector",
-]
+    "BRAX_PREFIX", "PLAYGROUND_PREFIX", "BraxEnv", "PlaygroundEnv", "to_brax", "to_gymnasium", "to_gymnasium_vector",
+]  # fmt: skip
 
 
 def to_brax(env: Env) -> "BraxExport":
