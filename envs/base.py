@@ -19,11 +19,6 @@ class PhysicsState(struct.PyTreeNode):
     qvel: Array  # [nv] generalised velocities
     qacc_warmstart: Array  # [nv] accelerations from which the constraint solver starts
 
-    @classmethod
-    def first(cls, qpos: Float[Array, " nq"], qvel: Float[Array, " nv"]) -> "PhysicsState":
-        """Return the state from which an episode starts; needs no forward pass."""
-        return cls(qpos, qvel, jnp.zeros_like(qvel))
-
 
 class State(struct.PyTreeNode):
     """A task at one tick; `reset` and `step` return the same structure, shapes and dtypes."""

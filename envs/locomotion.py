@@ -54,7 +54,7 @@ class Locomotion(Env):
         if self.robot.velocity_noise == "normal":
             noise = jnp.concatenate([noise[:nq], math.sqrt(2.0) * jax.scipy.special.erfinv(noise[nq:])])
         noise = self.robot.reset_noise * noise
-        physics = self._begin(PhysicsState.first(self._init_qpos + noise[:nq], noise[nq:]))
+        physics = self._begin(self.physics.init(self._init_qpos + noise[:nq], noise[nq:]))
         _, metrics = self._judge(physics, physics, jnp.zeros(self.action_size))
         metrics = jax.tree.map(jnp.zeros_like, metrics | {"unstable": jnp.zeros(())})
         return State.first(physics, self._observe(physics), metrics)

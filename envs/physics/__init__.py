@@ -1,17 +1,13 @@
 """Physics as a pure function of a small state, on interchangeable backends."""
 
-from typing import TYPE_CHECKING
-
 import jax
 from mujoco import MjModel
 
 from taic_jax.envs.errors import UnknownNameError
+from taic_jax.envs.physics.base import Physics
 from taic_jax.envs.physics.mujoco import MujocoPhysics
 
-if TYPE_CHECKING:
-    from taic_jax.envs.physics.mjx import MjxPhysics
-
-__all__ = ["BACKENDS", "MujocoPhysics", "make_physics"]
+__all__ = ["BACKENDS", "MujocoPhysics", "Physics", "make_physics"]
 
 BACKENDS = ("auto", "mujoco", "mjx", "warp")
 
@@ -24,7 +20,7 @@ def make_physics(
     *,
     iterations: int | None = None,
     ls_iterations: int | None = None,
-) -> "MujocoPhysics | MjxPhysics":
+) -> Physics:
     """Load a model on a backend.
 
     Args:

@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from taic_jax.envs.base import PhysicsState
 from taic_jax.envs.errors import BackendError, MissingExtraError
+from taic_jax.envs.physics.base import Physics
 from taic_jax.envs.third_party import third_party
 
 with third_party():
@@ -20,7 +21,7 @@ with third_party():
 _WARP_CAPACITY = {"naconmax": 32 * 8192, "njmax": 200}
 
 
-class MjxPhysics:
+class MjxPhysics(Physics):
     """Steps of MJX on a template `mjx.Data`, of which only `PhysicsState` and the controls change.
 
     Fewer solver iterations are faster and soon wrong: with a single one, the ant's joint velocities are off by
@@ -42,7 +43,8 @@ class MjxPhysics:
     ):
         if warp:
             _require_warp()
-        self.model, self.substeps, impl = model, substeps, "warp" if warp else "jax"
+        super().__init__(model, substeps)
+        impl = "warp" if warp else "jax"
         with third_party():
             mjx_model = mjx.put_model(model, impl=impl)
             option = mjx_model.opt.replace(
@@ -55,7 +57,7 @@ class MjxPhysics:
             self._data = mjx.make_data(model, impl=impl, **(_WARP_CAPACITY if warp else {}))
 
     def step(self, state: PhysicsState, ctrl: Float[Array, " nu"]) -> PhysicsState:
-        """Advance by one tick, i.e. all its substeps, under constant controls."""
+        """Advance by one tick under constant controls."""
 
         def substep(state: PhysicsState, _: None) -> tuple[PhysicsState, None]:
             data = self._data.replace(qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.qacc_warmstart, ctrl=ctrl)

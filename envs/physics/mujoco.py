@@ -15,6 +15,7 @@ from jax import Array
 from jaxtyping import Float
 
 from taic_jax.envs.base import PhysicsState
+from taic_jax.envs.physics.base import Physics
 from taic_jax.envs.physics.host_call import HostCall, host_calls_work
 from taic_jax.envs.physics.watchdog import Watchdog
 
@@ -31,7 +32,7 @@ LATE = (
 )
 
 
-class MujocoPhysics:
+class MujocoPhysics(Physics):
     """A host call of `mujoco.batch.Batch`; all leading axes (seeds, environments) are one engine call.
 
     It is pure: the engine's own memory between calls is scratch. Each call overwrites every state field that
@@ -47,14 +48,14 @@ class MujocoPhysics:
     def __init__(self, model: mujoco.MjModel, substeps: int, num_threads: int = 0):
         if model.na or model.nhistory or model.nmocap or model.nplugin or model.neq:
             raise ValueError("the model must have no activations, mocap bodies, plugins or equalities")
-        self.model, self.substeps = model, substeps
+        super().__init__(model, substeps)
         self.num_threads = num_threads or max(1, num_physical_cores() // jax.local_device_count())
         saved = np.empty(mujoco.mj_sizeModel(model), np.uint8)
         mujoco.mj_saveModel(model, None, saved)
         self.engine = _engine(saved.tobytes(), substeps, self.num_threads)
 
     def step(self, state: PhysicsState, ctrl: Float[Array, " nu"]) -> PhysicsState:
-        """Advance by one tick, i.e. all its substeps, under constant controls."""
+        """Advance by one tick under constant controls."""
         nq, nv = self.model.nq, self.model.nv
         sent = jnp.concatenate([state.qpos, state.qvel, state.qacc_warmstart, ctrl])
         # `pure_callback` serves accelerators and an XLA that refuses our host calls. On CPU it takes ten times as long
