@@ -4,11 +4,12 @@ if __name__ == "envs":  # would be a second copy of every class
     raise ImportError("this folder is the package `taic_jax.envs`; import it by that name")
 
 import ctypes.util
+import inspect
 import os
 import sys
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 # MuJoCo chooses how to draw when it is first imported. Its own choice needs a display. EGL does not, but
 # where that library is missing, to ask for it would make the import fail.
@@ -29,35 +30,14 @@ from taic_jax.envs.robots import ROBOTS, with_body
 from taic_jax.envs.wrappers import AutoReset, TimeLimit, Wrapper
 
 __all__ = [
-    "AntArena",
-    "AntTurn",
-    "AutoReset",
-    "BraxEnv",
-    "ContractError",
-    "Env",
-    "EnvOptionError",
-    "Locomotion",
-    "MissingExtraError",
-    "Navigation",
-    "PhysicsState",
-    "PlaygroundEnv",
-    "RenderingError",
-    "State",
-    "TimeLimit",
-    "UnknownNameError",
-    "Wrapper",
-    "check_contract",
-    "environment_names",
-    "environment_options",
-    "make_env",
-]
-
-# Of the options of `make_env`, their values when not given.
-_DEFAULTS = {"pipeline": "spring", "model": "brax", "body": "gym", "goal": "fixed", "change_after": 0}
+    "AntArena", "AntTurn", "AutoReset", "BraxEnv", "ContractError", "Env", "EnvOptionError", "Locomotion",
+    "MissingExtraError", "Navigation", "PhysicsState", "PlaygroundEnv", "RenderingError", "State", "TimeLimit",
+    "UnknownNameError", "Wrapper", "check_contract", "environment_names", "environment_options", "make_env",
+]  # fmt: skip
 
 
 class _Task(NamedTuple):
-    """How to make a task, from `backend`, `num_threads` where it has an engine, and these options."""
+    """A task's constructor; its arguments are these options, and `backend` and `num_threads` for an engine."""
 
     make: Callable[..., Env]
     options: tuple[str, ...] = ()
@@ -129,14 +109,13 @@ def make_env(
     task = _find(name)
     if backend not in BACKENDS:
         raise UnknownNameError("backend", backend, BACKENDS)
-    given = {"pipeline": pipeline, "model": model, "body": body, "goal": goal, "change_after": change_after}
-    for option, value in given.items():
-        if value != _DEFAULTS[option] and option not in task.options:
+    options = {"pipeline": pipeline, "model": model, "body": body, "goal": goal, "change_after": change_after}
+    defaults = inspect.signature(make_env).parameters
+    for option, value in options.items():
+        if option not in task.options and value != defaults[option].default:
             raise EnvOptionError(name, option, value, task.options)
-    options: dict[str, Any] = {option: given[option] for option in task.options}
-    if task.has_engine:
-        options |= {"backend": backend, "num_threads": num_threads}
-    env = task.make(**options)
+    engine = {"backend": backend, "num_threads": num_threads} if task.has_engine else {}
+    env = task.make(**{option: options[option] for option in task.options}, **engine)
     if name not in _TASKS:
         check_contract(env)
     return TimeLimit(env, env.episode_length)

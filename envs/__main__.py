@@ -5,7 +5,6 @@ python -m taic_jax.envs --out pictures --contact-sheet pictures/all.png
 
 import contextlib
 import dataclasses
-import difflib
 import io
 import math
 import os
@@ -24,6 +23,7 @@ from jaxtyping import Key, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
 from taic_jax.envs import AutoReset, Env, RenderingError, State, environment_names, make_env
+from taic_jax.envs.errors import nearest
 from taic_jax.envs.rendering import write_webp
 
 PROGRAM = "python -m taic_jax.envs"
@@ -49,14 +49,14 @@ class Arguments:
 
 
 class ArgumentError(ValueError):
-    """A mistake in the arguments, told in one line."""
+    """A mistake in the arguments; the message is one line."""
 
 
 def main(args: Sequence[str] | None = None) -> int:
     """Draw, and return the exit code: 0, or 2 where the arguments or this machine do not allow it."""
     try:
         draw(parse(sys.argv[1:] if args is None else args))
-    except BrokenPipeError:  # the reader, such as head, has seen enough
+    except BrokenPipeError:  # the reader, such as head, has stopped
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except (ValueError, OSError, RenderingError) as error:
         ours = type(error).__module__.partition(".")[0] in ("taic_jax", __name__)
@@ -68,24 +68,20 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 def parse(args: Sequence[str]) -> Arguments:
-    """Parse the arguments.
-
-    Raises:
-      ArgumentError: an argument is not valid.
-    """
+    """Parse the arguments; `ArgumentError` where one is not valid."""
     try:
         with contextlib.redirect_stderr(io.StringIO()):
             arguments = tyro.cli(Arguments, prog=PROGRAM, args=args)
     except SystemExit as stop:
         if not stop.code:
             raise
-        known = ["--" + field.name.replace("_", "-") for field in dataclasses.fields(Arguments)]
+        names = ["--" + field.name.replace("_", "-") for field in dataclasses.fields(Arguments)]
         for option in (arg.partition("=")[0] for arg in args if arg.startswith("--")):
-            if option.replace("_", "-") not in known:
-                near = difflib.get_close_matches(option, known, n=1)
-                hint = f"the nearest is {near[0]}" if near else f"there are {', '.join(known)}"
+            if option.replace("_", "-") not in names:
+                similar = nearest(option, names, cutoff=0.6)
+                hint = f"the nearest is {similar}" if similar else f"there are {', '.join(names)}"
                 raise ArgumentError(f"unknown option {option}; {hint}") from None
-        raise ArgumentError(f"expected {', '.join(known)} with their values, got {' '.join(args)!r}") from None
+        raise ArgumentError(f"expected {', '.join(names)} with their values, got {' '.join(args)!r}") from None
     if arguments.ticks < 1:
         raise ArgumentError(f"--ticks: expected at least 1, got {arguments.ticks}; the nearest valid value is 1")
     sheet = arguments.contact_sheet
@@ -95,7 +91,7 @@ def parse(args: Sequence[str]) -> Arguments:
 
 
 def draw(arguments: Arguments) -> None:
-    """Write the pictures, and print the path of each; a mistake in a name is told before any is written."""
+    """Write the pictures, and print the path of each; a mistake in a name raises before any is written."""
     envs = [make_env(name) for name in arguments.tasks or environment_names()]
     arguments.out.mkdir(parents=True, exist_ok=True)
     tiles = {}
@@ -104,10 +100,11 @@ def draw(arguments: Arguments) -> None:
         states = jax.device_get(random_episodes(env, key, arguments.ticks))
         frames = env.render(states.physics, height=HEIGHT, width=WIDTH)
         path = arguments.out / re.sub(r"[^\w-]+", "_", env.name)
+        picture, film = path.with_suffix(".png"), path.with_suffix(".webp")
         tiles[env.name] = frames[still(states.terminated | states.truncated)]
-        Image.fromarray(tiles[env.name]).save(path.with_suffix(".png"))
-        write_webp(path.with_suffix(".webp"), frames, env.dt)
-        print(path.with_suffix(".png"), path.with_suffix(".webp"), sep="\n", flush=True)
+        Image.fromarray(tiles[env.name]).save(picture)
+        write_webp(film, frames, env.dt)
+        print(picture, film, sep="\n", flush=True)
     if arguments.contact_sheet:
         arguments.contact_sheet.parent.mkdir(parents=True, exist_ok=True)
         contact_sheet(tiles).save(arguments.contact_sheet)
@@ -117,8 +114,7 @@ def draw(arguments: Arguments) -> None:
 def random_episodes(env: Env, key: Key[Array, ""], ticks: int) -> State:
     """Act at random but smoothly, with automatic resets; return the states after each tick, leading axis T.
 
-    The actions are white noise through a first-order filter: as the body is slow, it would average white
-    noise away and hardly move.
+    The actions are white noise through a first-order filter: a slow body would average white noise away.
     """
     env, keep = AutoReset(env), math.exp(-1.0 / MEMORY)
     key_reset, key_start, key_noise = jax.random.split(key, 3)

@@ -1,4 +1,4 @@
-"""What the paper's options are carried to: an ant that turns, and ants in a maze, before a block and a chasm."""
+"""Tasks for options learnt on the ant: to turn, and to reach a goal in a maze, behind a block or over a chasm."""
 
 import copy
 import dataclasses
@@ -13,7 +13,8 @@ from jaxtyping import Bool, Float, Key
 from taic_jax.envs.arenas import ANT_QPOS, ANT_QVEL, Arena, furnish
 from taic_jax.envs.base import PhysicsState, State
 from taic_jax.envs.errors import UnknownNameError
-from taic_jax.envs.locomotion import Locomotion
+from taic_jax.envs.locomotion import Judgement, Locomotion
+from taic_jax.envs.rendering import render_mujoco
 from taic_jax.envs.robots import ROBOTS, compile_spec, initial_qpos, load_spec, with_body
 
 SUCCESS_RADIUS = 5.0  # m, of HIRO
@@ -29,19 +30,19 @@ class AntTurn(Locomotion):
     """Turn left: the reward of `ant` with the yaw rate in rad/s in place of the forward speed."""
 
     def _begin(self, physics: PhysicsState) -> TurningState:
-        return TurningState(physics.qpos, physics.qvel, physics.qacc_warmstart, turns=jnp.zeros(()))
+        return TurningState(**vars(physics), turns=jnp.zeros(()))
 
     def _advance(self, before: TurningState, after: TurningState) -> TurningState:
         angle = wrapped(heading(after.qpos[3:7]) - heading(before.qpos[3:7]))
         return after.replace(turns=before.turns + angle / (2 * jnp.pi))
 
-    def _progress(self, before: TurningState, after: TurningState) -> tuple[Float[Array, ""], dict[str, Array]]:
+    def _progress(self, before: TurningState, after: TurningState) -> Judgement:
         rate = 2 * jnp.pi * (after.turns - before.turns) / self.dt
         return rate, {"yaw_rate": rate, "turns": after.turns}
 
 
 class ArenaState(PhysicsState):
-    """The simulation, and what an episode remembers besides it."""
+    """The simulation, the goal, and the episode's record."""
 
     goal: Array  # [2] or [3] m
     closest: Array  # [] m, smallest distance to the goal so far
@@ -62,23 +63,16 @@ class AntArena(Locomotion):
       body: of the ant, see `with_body`; options learnt on `ant` apply where it has the same.
       goal: `fixed`; `near`, where the arena has one; or, as in HIRO's maze, `uniform` in the room while training and
         fixed in evaluation.
-      backend: see `make_physics`.
-      num_threads: see `make_physics`.
+      backend, num_threads: see `make_physics`.
 
     Raises:
       UnknownNameError: if there is no such body or goal.
     """
 
     def __init__(
-        self,
-        name: str,
-        arena: Arena,
-        body: str = "gym",
-        goal: str = "fixed",
-        backend: str = "auto",
-        num_threads: int = 0,
+        self, name: str, arena: Arena, body: str, goal: str = "fixed", backend: str = "auto", num_threads: int = 0
     ):
-        goals = ("fixed", "uniform") if arena.near_goal is None else ("fixed", "near", "uniform")
+        goals = ("fixed", *(("near",) if arena.near_goal else ()), "uniform")
         if goal not in goals:
             raise UnknownNameError("goal", goal, goals)
         if goal == "near":
@@ -116,8 +110,6 @@ class AntArena(Locomotion):
 
     def render(self, physics: ArenaState, *, height: int = 240, width: int = 320) -> np.ndarray:
         """Draw the arena with MuJoCo's renderer, from above."""
-        from taic_jax.envs.rendering import render_mujoco
-
         goal = np.asarray(physics.goal)
         if goal.shape[1] == 2:
             goal = np.concatenate([goal, np.full((len(goal), 1), 0.5, goal.dtype)], axis=1)
@@ -165,9 +157,7 @@ class AntArena(Locomotion):
     def _is_healthy(self, physics: PhysicsState) -> Bool[Array, ""]:
         return jnp.ones((), bool)
 
-    def _judge(
-        self, before: ArenaState, after: ArenaState, action: Float[Array, " A"]
-    ) -> tuple[Float[Array, ""], dict[str, Array]]:
+    def _judge(self, before: ArenaState, after: ArenaState, action: Float[Array, " A"]) -> Judgement:
         distance = self._distance(after)
         metrics = {
             "distance": distance,

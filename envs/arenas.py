@@ -1,4 +1,4 @@
-"""The three arenas of HIRO as data, and how the ant's model is put into one of them.
+"""The three arenas of HIRO as data, and the ant's model in one of them.
 
 Each is a rectangular room with at most three solids (a bar, pillars or platforms, all 4 m high) and perhaps a
 movable block. The outer walls are four planes, the cheapest shape to collide with, and solids are boxes.
@@ -17,14 +17,10 @@ TOLERANCE = 0.05  # m, by which a block may overrun its soft limits
 # Bits for contype and conaffinity: which pairs may collide. The ant meets everything but itself. A block meets
 # the solids named by its arena; everywhere else its joint limits hold it, and contacts would make it jam.
 _ANT, _BLOCK = 1, 2
+_GEOM = mujoco.mjtGeom
 
-_GROUND, _BODY, _WALL, _MOVABLE, _GOAL = (
-    (0.5, 0.52, 0.5, 1),
-    (0.95, 0.6, 0.1, 1),
-    (0.55, 0.6, 0.68, 1),
-    (0.82, 0.45, 0.3, 1),
-    (0.2, 0.7, 0.35, 1),
-)
+_GROUND, _BODY, _WALL = (0.5, 0.52, 0.5, 1), (0.95, 0.6, 0.1, 1), (0.55, 0.6, 0.68, 1)
+_MOVABLE, _GOAL = (0.82, 0.45, 0.3, 1), (0.2, 0.7, 0.35, 1)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,16 +93,15 @@ def furnish(spec: mujoco.MjSpec, arena: Arena) -> None:
     """
     for geom in spec.geoms:
         if geom.name == "floor":
-            geom.conaffinity = _ANT
-            geom.material, geom.rgba = "", _GROUND
+            geom.conaffinity, geom.material, geom.rgba = _ANT, "", _GROUND
         else:
-            is_foot = geom.type == mujoco.mjtGeom.mjGEOM_SPHERE and geom.name != "torso_geom"
+            is_foot = geom.type == _GEOM.mjGEOM_SPHERE and geom.name != "torso_geom"
             geom.contype, geom.conaffinity = (0, 0) if is_foot else (_ANT, 0)
             geom.rgba = _BODY  # to be seen from above
     _add_walls(spec, arena)
     for i, solid in enumerate(arena.solids):
         meets = _ANT | (_BLOCK if arena.block and i in arena.block.meets else 0)
-        _add_box(spec.worldbody, f"solid_{i}", solid, meets)
+        _add_solid(spec, f"solid_{i}", solid, meets)
     if arena.block:
         _add_block(spec, arena.block)
     goal = (*arena.goal, arena.ground + 0.5)[:3]
@@ -131,37 +126,28 @@ def outside(arena: Arena, qpos: Float[np.ndarray, "*batch nq"]) -> int:
 def _add_walls(spec: mujoco.MjSpec, arena: Arena) -> None:
     x_low, y_low, x_high, y_high = arena.room
     x, y, height = (x_low + x_high) / 2, (y_low + y_high) / 2, arena.ground + SOLID_HEIGHT
-    for name, pos, inward in (
+    for name, place, inward in (
         ("west", (x_low, y), (1, 0)),
         ("south", (x, y_low), (0, 1)),
         ("east", (x_high, y), (-1, 0)),
         ("north", (x, y_high), (0, -1)),
     ):
         half_length = (y_high - y_low if inward[0] else x_high - x_low) / 2
+        pos, size = (*place, height / 2), (height / 2, half_length, 1)
         wall = spec.worldbody.add_geom(
-            name=name,
-            type=mujoco.mjtGeom.mjGEOM_PLANE,
-            pos=(*pos, height / 2),
-            size=(height / 2, half_length, 1),
-            rgba=_WALL,
-            contype=0,
-            conaffinity=_ANT,
+            name=name, type=_GEOM.mjGEOM_PLANE, pos=pos, size=size, rgba=_WALL, contype=0, conaffinity=_ANT
         )
         # A plane's normal is its z axis; its x axis, the first of its sizes as drawn, points up.
         wall.alt.type = mujoco.mjtOrientation.mjORIENTATION_XYAXES
         wall.alt.xyaxes = (0, 0, 1, inward[1], -inward[0], 0)
 
 
-def _add_box(body: mujoco.MjsBody, name: str, rectangle: tuple[float, ...], conaffinity: int) -> None:
+def _add_solid(spec: mujoco.MjSpec, name: str, rectangle: tuple[float, ...], meets: int) -> None:
     x_low, y_low, x_high, y_high = rectangle
-    body.add_geom(
-        name=name,
-        type=mujoco.mjtGeom.mjGEOM_BOX,
-        pos=((x_low + x_high) / 2, (y_low + y_high) / 2, SOLID_HEIGHT / 2),
-        size=((x_high - x_low) / 2, (y_high - y_low) / 2, SOLID_HEIGHT / 2),
-        rgba=_WALL,
-        contype=0,
-        conaffinity=conaffinity,
+    pos = ((x_low + x_high) / 2, (y_low + y_high) / 2, SOLID_HEIGHT / 2)
+    half = ((x_high - x_low) / 2, (y_high - y_low) / 2, SOLID_HEIGHT / 2)
+    spec.worldbody.add_geom(
+        name=name, type=_GEOM.mjGEOM_BOX, pos=pos, size=half, rgba=_WALL, contype=0, conaffinity=meets
     )
 
 
@@ -177,15 +163,8 @@ def _add_block(spec: mujoco.MjSpec, block: Block) -> None:
             damping=[slide.damping, 0, 0],
             armature=0,
         )
-    body.add_geom(
-        name="block",
-        type=mujoco.mjtGeom.mjGEOM_BOX,
-        size=block.half,
-        mass=block.mass,
-        rgba=_MOVABLE,
-        contype=_BLOCK,
-        conaffinity=_ANT,
-    )
+    shape = {"type": _GEOM.mjGEOM_BOX, "size": block.half, "mass": block.mass, "rgba": _MOVABLE}
+    body.add_geom(name="block", **shape, contype=_BLOCK, conaffinity=_ANT)
 
 
 def _add_camera(spec: mujoco.MjSpec, arena: Arena) -> None:

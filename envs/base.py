@@ -1,8 +1,9 @@
-"""The contract every task keeps: `Env`, a pair of pure unbatched functions on a `State` of arrays."""
+"""The contract of every task: `Env`, a pair of pure unbatched functions on a `State` of arrays."""
 
 import abc
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import Array
@@ -20,7 +21,7 @@ class PhysicsState(struct.PyTreeNode):
 
 
 class State(struct.PyTreeNode):
-    """What a task hands over at every tick; `reset` and `step` give the same structure, shapes and dtypes."""
+    """A task at one tick; `reset` and `step` return the same structure, shapes and dtypes."""
 
     physics: Any  # the task's own small pytree, e.g. `PhysicsState`
     obs: Array  # [S] float32
@@ -32,6 +33,12 @@ class State(struct.PyTreeNode):
     tick: Array = struct.field(default=None)  # [] int32, ticks since reset (`TimeLimit`)
     key: Array = struct.field(default=None)  # typed PRNG key of the resets to come (`AutoReset`)
     final_obs: Array = struct.field(default=None)  # [S] before a reset; equals obs if none happened (`AutoReset`)
+
+    @classmethod
+    def first(cls, physics: Any, obs: Float[Array, " S"], metrics: dict[str, Array]) -> "State":
+        """Return an episode's first state: nothing earned, nothing ended."""
+        no = jnp.zeros((), bool)
+        return cls(physics, obs, jnp.zeros(()), terminated=no, truncated=no, metrics=metrics)
 
 
 class Env(abc.ABC):
@@ -52,7 +59,7 @@ class Env(abc.ABC):
 
     @property
     def evaluated(self) -> "Env":
-        """The task as evaluation sets it: this one, but where training draws what evaluation keeps fixed."""
+        """The task as evaluation sets it: this one, but where training draws at random and evaluation does not."""
         return self
 
     @abc.abstractmethod

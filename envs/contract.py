@@ -1,4 +1,4 @@
-"""The contract of `Env`, held against an environment without compiling or running it."""
+"""A check of the contract of `Env` that neither compiles nor runs the environment."""
 
 import math
 import sys
@@ -20,7 +20,7 @@ _METHODS = ("reset", "step", "render")
 def check_contract(env: Env) -> None:
     """Refuse an environment that breaks the contract of `Env`, by abstract evaluation alone.
 
-    `TimeLimit` and `AutoReset` are looked through: what is checked is the environment inside.
+    Of `TimeLimit` and `AutoReset` only the attributes are checked, besides the whole environment inside.
 
     Raises:
       ContractError: the first breach; the message starts with the environment's name and the field.
@@ -53,31 +53,28 @@ def _check_attributes(env: Env) -> None:
         if isinstance(size, bool) or not isinstance(size, (int, np.integer)) or size < 1:
             raise ContractError(name, field, f"got {size!r}, expected an integer of at least 1")
     if env.proprioceptive_size > env.observation_size:
-        raise ContractError(
-            name,
-            "proprioceptive_size",
-            f"got {env.proprioceptive_size}, expected at most observation_size, {env.observation_size}",
-        )
+        problem = f"got {env.proprioceptive_size}, expected at most observation_size, {env.observation_size}"
+        raise ContractError(name, "proprioceptive_size", problem)
     if isinstance(env.dt, bool) or not isinstance(env.dt, (int, float, np.number)) or not 0 < env.dt < math.inf:
         raise ContractError(name, "dt", f"got {env.dt!r}, expected a positive number of seconds")
 
 
 def _trace(env: Env, method: str, *arguments: Any) -> State:
-    """Call a method on abstract arrays; what it raises is told with the line of the environment's own file."""
+    """Call a method on abstract arrays; the error names its exception and the line of the environment's own file."""
     try:
         state = jax.eval_shape(getattr(env, method), *arguments)
     except Exception as error:
         file = getattr(sys.modules.get(type(env).__module__), "__file__", None)
         lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == file]
-        where = f" (line {lines[-1]} of {file})" if lines else ""
-        what = " ".join([f"{type(error).__name__}:", *str(error).partition("\n")[0].split()])
-        raise ContractError(env.name, method, f"cannot be traced by JAX: {what}{where}") from error
+        place = f" (line {lines[-1]} of {file})" if lines else ""
+        message = " ".join([f"{type(error).__name__}:", *str(error).partition("\n")[0].split()])
+        raise ContractError(env.name, method, f"cannot be traced by JAX: {message}{place}") from error
     _check_state(env, method, state)
     return state
 
 
 def _check_state(env: Env, method: str, state: Any) -> None:
-    """Hold what one method returns against the shapes and dtypes that `State` promises."""
+    """Compare a method's result with the shapes and dtypes that `State` promises."""
     if not isinstance(state, State):
         raise ContractError(env.name, method, f"returns {type(state).__name__}, expected State")
     if not isinstance(state.metrics, dict):
@@ -98,25 +95,20 @@ def _check_state(env: Env, method: str, state: Any) -> None:
 def _check_same(env: Env, start: State, method: str, after: State) -> None:
     """Refuse a method that changes structure, shapes, dtypes or weak types of what reset made."""
     if start.metrics.keys() != after.metrics.keys():
-        given, expected = _names(after.metrics), _names(start.metrics)
-        raise ContractError(env.name, "metrics", f"{method} returns {given}, reset returns {expected}")
+        new, old = ("{" + ", ".join(sorted(map(repr, state.metrics))) + "}" for state in (after, start))
+        raise ContractError(env.name, "metrics", f"{method} returns {new}, reset returns {old}")
     for field in State.__dataclass_fields__:
-        made, kept = getattr(start, field), getattr(after, field)
-        old, new = _leaves(field, made), _leaves(field, kept)
-        for path in {**old, **new}:
-            given, expected = _show(new.get(path)), _show(old.get(path))
-            if given != expected:
-                raise ContractError(env.name, path, f"{method} returns {given}, reset returns {expected}")
-        if jax.tree.structure(made) != jax.tree.structure(kept):
+        trees = getattr(after, field), getattr(start, field)
+        leaves = [
+            {field + jax.tree_util.keystr(path): leaf for path, leaf in jax.tree.leaves_with_path(tree)}
+            for tree in trees
+        ]
+        for path in leaves[1] | leaves[0]:
+            new, old = (_show(each.get(path)) for each in leaves)
+            if new != old:
+                raise ContractError(env.name, path, f"{method} returns {new}, reset returns {old}")
+        if jax.tree.structure(trees[0]) != jax.tree.structure(trees[1]):
             raise ContractError(env.name, field, f"{method} returns another kind of tree than reset")
-
-
-def _leaves(field: str, tree: Any) -> dict[str, Any]:
-    return {field + jax.tree_util.keystr(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(tree)}
-
-
-def _names(metrics: dict[str, Any]) -> str:
-    return "{" + ", ".join(sorted(map(repr, metrics))) + "}"
 
 
 def _show(value: Any) -> str:

@@ -1,6 +1,5 @@
-"""Environments of your own: a class in a Python file or an importable module, found by its name."""
+"""Environments of your own: a class in a Python file or an importable module, by its name."""
 
-import difflib
 import hashlib
 import importlib
 import importlib.util
@@ -8,19 +7,18 @@ import inspect
 import pkgutil
 import sys
 import traceback
-from collections.abc import Iterable
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NoReturn
 
 from taic_jax.envs.base import Env
-from taic_jax.envs.errors import UnknownNameError
+from taic_jax.envs.errors import UnknownNameError, nearest
 
 FORMS = "FILE.py:CLASS or MODULE:CLASS"
 
 
 class CustomEnvError(ValueError):
-    """An environment of the user's own cannot be loaded; told in one line."""
+    """An environment of the user's own cannot be loaded; the message is one line."""
 
 
 def load_custom(name: str, backend: str = "auto", num_threads: int = 0) -> Env:
@@ -28,7 +26,7 @@ def load_custom(name: str, backend: str = "auto", num_threads: int = 0) -> Env:
 
     Args:
       name: `FILE.py:CLASS` or `MODULE:CLASS`.
-      backend: given to the class if its `__init__` has a parameter of this name (see `physics.make_physics`).
+      backend: for the class if its `__init__` has a parameter of this name (see `physics.make_physics`).
       num_threads: likewise.
 
     Raises:
@@ -42,9 +40,9 @@ def load_custom(name: str, backend: str = "auto", num_threads: int = 0) -> Env:
     module = _load_file(source) if source.endswith(".py") else _load_module(source)
     cls = _find_class(module, source, class_name)
     parameters = inspect.signature(cls.__init__).parameters
-    given = {"backend": backend, "num_threads": num_threads}
+    engine = {"backend": backend, "num_threads": num_threads}
     try:
-        return cls(**{key: value for key, value in given.items() if key in parameters})
+        return cls(**{key: value for key, value in engine.items() if key in parameters})
     except Exception as error:
         _failed(f"making {name}", getattr(module, "__file__", None), error)
 
@@ -53,8 +51,8 @@ def _load_file(source: str) -> ModuleType:
     """Import a file under a name that no other module can have; a second time, return the same module."""
     path = Path(source).resolve()
     if not path.is_file():
-        nearest = _nearest(path.name, (file.name for file in path.parent.glob("*.py")))
-        hint = f"the nearest is {Path(source).parent / nearest}" if nearest else f"{path.parent} holds no .py files"
+        similar = nearest(path.name, (file.name for file in path.parent.glob("*.py")))
+        hint = f"the nearest is {Path(source).parent / similar}" if similar else f"{path.parent} holds no .py files"
         raise CustomEnvError(f"environment in {source}: no such file; {hint}")
     # Not derived from the file's name: that may be the name of another module, or have dots, i.e. a parent.
     name = f"custom_env_{hashlib.sha256(str(path).encode()).hexdigest()}"
@@ -78,40 +76,37 @@ def _load_module(source: str) -> ModuleType:
         missing = error.name if isinstance(error, ModuleNotFoundError) else None
         if missing is None or not f"{source}.".startswith(f"{missing}."):
             _failed(f"importing {source}", None, error)
-        parent = missing.rpartition(".")[0]
+        parent, dot, name = missing.rpartition(".")
         folders = getattr(sys.modules[parent], "__path__", []) if parent else None
-        nearest = _nearest(missing.rpartition(".")[2], (module.name for module in pkgutil.iter_modules(folders)))
-        hint = f"the nearest is {parent}{'.' * bool(parent)}{nearest}" if nearest else f"{parent} holds none"
+        similar = nearest(name, (module.name for module in pkgutil.iter_modules(folders)))
+        hint = f"the nearest is {parent}{dot}{similar}" if similar else f"{parent} holds none"
         raise CustomEnvError(f"environment in {source}: no module {missing}; {hint}; expected {FORMS}") from error
 
 
 def _find_class(module: ModuleType, source: str, class_name: str) -> Any:
-    """Return the class; a wrong name is told with the nearest right one."""
-    found = getattr(module, class_name, None)
-    if isinstance(found, type) and issubclass(found, Env):
-        missing = sorted(getattr(found, "__abstractmethods__", ()))
-        if missing:
-            raise CustomEnvError(f"environment {source}:{class_name}: expected it to define {', '.join(missing)}")
-        return found
-    known = [key for key, value in vars(module).items() if isinstance(value, type) and issubclass(value, Env)]
-    known = [f"{source}:{key}" for key in known if getattr(module, key) is not Env]
-    name = f"{source}:{class_name}"
-    if found is None and known:
-        raise UnknownNameError("environment", name, known)
-    nearest = _nearest(name, known)
-    hint = f"the nearest is {nearest}" if nearest else f"{source} has none"
-    got = "nothing of this name" if found is None else f"class {class_name}" if isinstance(found, type) else repr(found)
+    """Return the class, or raise an error that names the nearest."""
+    name, value = f"{source}:{class_name}", getattr(module, class_name, None)
+    if _is_environment(value):
+        if missing := sorted(getattr(value, "__abstractmethods__", ())):
+            raise CustomEnvError(f"environment {name}: expected it to define {', '.join(missing)}")
+        return value
+    names = [f"{source}:{key}" for key, each in vars(module).items() if _is_environment(each) and each is not Env]
+    if value is None and names:
+        raise UnknownNameError("environment", name, names)
+    similar = nearest(name, names)
+    hint = f"the nearest is {similar}" if similar else f"{source} has none"
+    got = "nothing of this name" if value is None else f"class {class_name}" if isinstance(value, type) else repr(value)
     raise CustomEnvError(f"environment {name}: expected a subclass of taic_jax.envs.Env, got {got}; {hint}")
+
+
+def _is_environment(value: Any) -> bool:
+    return isinstance(value, type) and issubclass(value, Env)
 
 
 def _failed(doing: str, path: str | None, error: BaseException) -> NoReturn:
     """Raise what went wrong in the user's code, with the innermost line of `path`, or else of any file."""
     frames = traceback.extract_tb(error.__traceback__)
     frame = ([frame for frame in frames if frame.filename == path] or frames)[-1]
-    what = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
-    where = "" if isinstance(error, SyntaxError) else f" (line {frame.lineno} of {frame.filename})"
-    raise CustomEnvError(" ".join(f"{doing}: {what}{where}".split())) from error
-
-
-def _nearest(name: str, names: Iterable[str]) -> str | None:
-    return next(iter(difflib.get_close_matches(name, list(names), n=1, cutoff=0.0)), None)
+    message = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+    place = "" if isinstance(error, SyntaxError) else f" (line {frame.lineno} of {frame.filename})"
+    raise CustomEnvError(" ".join(f"{doing}: {message}{place}".split())) from error

@@ -4,14 +4,19 @@ import difflib
 from collections.abc import Iterable
 
 
+def nearest(name: str, names: Iterable[str], cutoff: float = 0.0) -> str | None:
+    """Return the name most like `name`, or None where the likeness, from 0 to 1, is below the cutoff for all."""
+    return next(iter(difflib.get_close_matches(name, list(names), n=1, cutoff=cutoff)), None)
+
+
 class UnknownNameError(ValueError):
     """A name, of an environment say, that does not exist; the message gives the nearest that does."""
 
-    def __init__(self, kind: str, given: str, valid: Iterable[str]):
+    def __init__(self, kind: str, name: str, valid: Iterable[str]):
         valid = list(valid)
-        nearest = difflib.get_close_matches(given, valid, n=1, cutoff=0.5)
-        hint = f"did you mean {nearest[0]!r}? " if nearest else ""
-        super().__init__(f"unknown {kind} {given!r}: {hint}valid: {', '.join(valid)}")
+        similar = nearest(name, valid, cutoff=0.5)
+        hint = f"did you mean {similar!r}? " if similar else ""
+        super().__init__(f"unknown {kind} {name!r}: {hint}valid: {', '.join(valid)}")
 
 
 class MissingExtraError(ImportError, ValueError):
@@ -33,8 +38,8 @@ class EnvOptionError(ValueError):
     """An option of `make_env` that the task does not have."""
 
     def __init__(self, task: str, option: str, value: object, options: Iterable[str]):
-        known = ", ".join(options) or "none"
-        super().__init__(f"env.{option}: {task} has no such option, got {value!r}; its options: {known}")
+        valid = ", ".join(options) or "none"
+        super().__init__(f"env.{option}: {task} has no such option, got {value!r}; its options: {valid}")
 
 
 class AdapterError(ValueError):

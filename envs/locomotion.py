@@ -11,8 +11,12 @@ from jaxtyping import Bool, Float, Key
 
 from taic_jax.envs.base import Env, PhysicsState, State
 from taic_jax.envs.physics import make_physics
+from taic_jax.envs.rendering import render_mujoco
 from taic_jax.envs.robots import Robot, compile_spec, initial_qpos, load_spec
 from taic_jax.envs.views import Views, make_views
+
+Judgement = tuple[Float[Array, ""], dict[str, Array]]
+"""A reward, or a term of it, and metrics."""
 
 
 class Locomotion(Env):
@@ -20,27 +24,14 @@ class Locomotion(Env):
 
     Observation: qpos without the place on the ground, then qvel. Positions are read from qpos, which, unlike
     the world positions of bodies, is current after a step. A simulation that diverges ends the episode in its
-    last finite state.
-
-    Args:
-      name: the task's.
-      robot: the body's description.
-      backend: see `make_physics`.
-      num_threads: see `make_physics`.
+    last finite state. For `backend` and `num_threads` see `make_physics`.
     """
 
     def __init__(self, name: str, robot: Robot, backend: str = "auto", num_threads: int = 0):
-        self.name = name
-        self.robot = robot
+        self.name, self.robot = name, robot
         self.model = self._make_model()
-        self.physics = make_physics(
-            self.model,
-            robot.substeps,
-            backend,
-            num_threads,
-            iterations=robot.iterations,
-            ls_iterations=robot.ls_iterations,
-        )
+        solver = {"iterations": robot.iterations, "ls_iterations": robot.ls_iterations}
+        self.physics = make_physics(self.model, robot.substeps, backend, num_threads, **solver)
         self.episode_length = robot.episode_length
         self.action_size = self.model.nu
         self.dt = self.model.opt.timestep * robot.substeps
@@ -64,16 +55,9 @@ class Locomotion(Env):
             noise = jnp.concatenate([noise[:nq], math.sqrt(2.0) * jax.scipy.special.erfinv(noise[nq:])])
         noise = self.robot.reset_noise * noise
         physics = self._begin(self.physics.init(self._init_qpos + noise[:nq], noise[nq:]))
-        zero, no = jnp.zeros(()), jnp.zeros((), bool)
         _, metrics = self._judge(physics, physics, jnp.zeros(self.action_size))
-        return State(
-            physics=physics,
-            obs=self._observe(physics),
-            reward=zero,
-            terminated=no,
-            truncated=no,
-            metrics=jax.tree.map(jnp.zeros_like, metrics | {"unstable": zero}),
-        )
+        metrics = jax.tree.map(jnp.zeros_like, metrics | {"unstable": jnp.zeros(())})
+        return State.first(physics, self._observe(physics), metrics)
 
     def step(self, state: State, action: Float[Array, " A"]) -> State:
         """Simulate one tick and pay for it.
@@ -96,8 +80,6 @@ class Locomotion(Env):
 
     def render(self, physics: PhysicsState, *, height: int = 240, width: int = 320) -> np.ndarray:
         """Draw with MuJoCo's renderer, from the tracking camera."""
-        from taic_jax.envs.rendering import render_mujoco
-
         return render_mujoco(self.model, physics.qpos, height=height, width=width)
 
     def _make_model(self) -> mujoco.MjModel:
@@ -107,11 +89,11 @@ class Locomotion(Env):
         return initial_qpos(self.robot, self.model)
 
     def _begin(self, physics: PhysicsState) -> PhysicsState:
-        """Add what a task remembers besides the simulation."""
+        """Add a task's own memory to the simulation's state."""
         return physics
 
     def _advance(self, before: PhysicsState, after: PhysicsState) -> PhysicsState:
-        """Bring up to date what a task remembers besides the simulation."""
+        """Bring a task's own memory up to date."""
         return after
 
     def _observe(self, physics: PhysicsState) -> Float[Array, " S"]:
@@ -134,9 +116,7 @@ class Locomotion(Env):
             healthy &= jnp.all(jnp.abs(rest) < robot.healthy_state)
         return healthy
 
-    def _judge(
-        self, before: PhysicsState, after: PhysicsState, action: Float[Array, " A"]
-    ) -> tuple[Float[Array, ""], dict[str, Array]]:
+    def _judge(self, before: PhysicsState, after: PhysicsState, action: Float[Array, " A"]) -> Judgement:
         """Return the tick's reward and metrics."""
         robot = self.robot
         healthy_reward = jnp.float32(robot.healthy_reward)
@@ -147,6 +127,6 @@ class Locomotion(Env):
         metrics |= {"healthy_reward": healthy_reward, "control_cost": control_cost}
         return progress + healthy_reward - control_cost, metrics
 
-    def _progress(self, before: PhysicsState, after: PhysicsState) -> tuple[Float[Array, ""], dict[str, Array]]:
+    def _progress(self, before: PhysicsState, after: PhysicsState) -> Judgement:
         velocity = (after.qpos[0] - before.qpos[0]) / self.dt
         return velocity, {"forward_reward": velocity, "x_velocity": velocity}

@@ -12,6 +12,7 @@ from taic_jax.envs.base import Env, State
 ROOM = 10.0  # m, side of the room
 MAX_SPEED = 1.0  # m/s on each axis
 GOAL_RADIUS = 0.5  # m
+_FLOOR, _WALL, _GOAL, _POINT = "#f4f1ea", "#3d4451", "#3a9d5d", "#d1495b"  # colours of its picture
 CELL = 0.1  # m, raster from which free points are drawn
 START, GOAL = (1.0, 5.0), (9.0, 5.0)  # m, of the task with fixed ends
 
@@ -22,13 +23,13 @@ BASE_MAP = np.array(
 )
 
 
-# What appears later (section 4.1, figure 4): a pocket behind the wall's lower gap. Who takes the shortest way is
-# caught 1.8 m behind that gap; only the upper one still leads to the goal.
+# It appears later (section 4.1, figure 4): a pocket behind the wall's lower gap. The shortest way ends 1.8 m behind
+# that gap; only the upper one still leads to the goal.
 TRAP = np.array([[7.0, 3.0, 7.4, 7.0], [5.2, 2.8, 7.4, 3.2], [5.2, 6.8, 7.4, 7.2]], np.float32)
 
 
 class NavigationState(struct.PyTreeNode):
-    """Where the point is, where it shall go, and how often it has tried."""
+    """The point's position and goal, and how often it has tried."""
 
     position: Array  # [2] m
     goal: Array  # [2] m
@@ -54,10 +55,7 @@ class Navigation(Env):
     dt = 0.2
 
     def __init__(
-        self,
-        walls: Float[Array | np.ndarray, "R 4"] = BASE_MAP,
-        random_ends: bool = False,
-        change_after: int = 0,
+        self, walls: Float[Array | np.ndarray, "R 4"] = BASE_MAP, random_ends: bool = False, change_after: int = 0
     ):
         self.name = "nav2d_random" if random_ends else "nav2d"
         self.observation_size = 4 if random_ends else 2
@@ -82,17 +80,8 @@ class Navigation(Env):
         position, goal = jnp.array(START), jnp.array(GOAL)
         if self.random_ends:
             position, goal = jax.vmap(self._free_point)(jax.random.uniform(key, (2, 3)))
-        physics = NavigationState(position=position, goal=goal, episode=episode)
-        no = jnp.zeros((), bool)
-        metrics = self._metrics(physics)
-        return State(
-            physics=physics,
-            obs=self._observe(physics),
-            reward=jnp.zeros(()),
-            terminated=no,
-            truncated=no,
-            metrics=metrics,
-        )
+        physics = NavigationState(position, goal, episode)
+        return State.first(physics, self._observe(physics), self._metrics(physics))
 
     def step(self, state: State, action: Float[Array, " 2"]) -> State:
         """Move by one tick, first along x, then along y."""
@@ -114,20 +103,43 @@ class Navigation(Env):
         )
 
     def render(self, physics: NavigationState, *, height: int = 240, width: int = 320) -> np.ndarray:
-        """Draw room, obstacles, start, goal and the path so far."""
-        from taic_jax.envs.rendering import render_room
+        """Draw room, obstacles, start, goal, and the episode's path so far: a move too long for a tick is a reset."""
+        from matplotlib.backends.backend_agg import FigureCanvasAgg  # matplotlib takes a while to import
+        from matplotlib.figure import Figure
+        from matplotlib.patches import Circle, Rectangle
 
-        return render_room(
-            np.asarray(self.walls),
-            np.asarray(self._standing(np.asarray(physics.episode)[:, None])),
-            physics.position,
-            physics.goal,
-            size=ROOM,
-            goal_radius=GOAL_RADIUS,
-            longest_move=1.01 * MAX_SPEED * self.dt,
-            height=height,
-            width=width,
-        )
+        dpi = height / 2.4  # lines and dots grow with the frame
+        figure = Figure(figsize=(width / dpi, height / dpi), dpi=dpi, facecolor="white")
+        canvas = FigureCanvasAgg(figure)
+        axes = figure.add_axes((0.02, 0.02, 0.96, 0.96), xlim=(0, ROOM), ylim=(0, ROOM), aspect="equal")
+        axes.set(xticks=[], yticks=[], facecolor=_FLOOR)
+        for spine in axes.spines.values():
+            spine.set(color=_WALL, linewidth=2)
+        patches = [
+            Rectangle((x, y), x_high - x, y_high - y, color=_WALL) for x, y, x_high, y_high in np.asarray(self.walls)
+        ]
+        target = Circle((0, 0), GOAL_RADIUS, color=_GOAL, alpha=0.6, linewidth=0)
+        for patch in (*patches, target):
+            axes.add_patch(patch)
+        (path,) = axes.plot([], [], color=_POINT, linewidth=1.5, alpha=0.7, solid_capstyle="round")
+        (start,) = axes.plot([], [], "o", markersize=6, markerfacecolor="white", markeredgecolor=_POINT)
+        (point,) = axes.plot([], [], "o", markersize=7, color=_POINT, markeredgecolor="white", clip_on=False)
+        point.set_zorder(9)  # above the walls
+
+        position, goal = np.asarray(physics.position), np.asarray(physics.goal)
+        standing, begin, frames = self._standing(np.asarray(physics.episode)[:, None]), 0, []
+        for t, here in enumerate(position):
+            if np.abs(here - position[max(t - 1, 0)]).max() > 1.01 * MAX_SPEED * self.dt:
+                begin = t
+            for patch, stands in zip(patches, standing[t], strict=True):
+                patch.set_visible(stands)
+            target.set_center(goal[t])
+            path.set_data(*position[begin : t + 1].T)
+            start.set_data(*position[begin : begin + 1].T)
+            point.set_data(*here[:, None])
+            canvas.draw()
+            frames.append(np.asarray(canvas.buffer_rgba())[..., :3].copy())
+        return np.stack(frames)
 
     def _observe(self, physics: NavigationState) -> Float[Array, " S"]:
         points = [physics.position, physics.goal] if self.random_ends else [physics.position]
@@ -141,7 +153,7 @@ class Navigation(Env):
         return metrics
 
     def _standing(self, episode: Int[Array | np.ndarray, "*T 1"]) -> Bool[Array | np.ndarray, "*T R"]:
-        """Tell which walls stand in which episode."""
+        """Return which walls stand in which episode."""
         return self._since <= episode
 
     def _free_point(self, uniform: Float[Array, " 3"]) -> Float[Array, " 2"]:
@@ -153,7 +165,7 @@ class Navigation(Env):
 def inside(
     point: Float[Array, " 2"], walls: Float[Array, "R 4"], standing: Bool[Array | np.ndarray, " R"]
 ) -> Bool[Array, ""]:
-    """Tell whether a point lies in any of the standing rectangles; their edges belong to them."""
+    """Return whether a point lies in any of the standing rectangles; their edges belong to them."""
     return jnp.any(standing & jnp.all((walls[:, :2] <= point[None]) & (point[None] <= walls[:, 2:]), axis=1))
 
 

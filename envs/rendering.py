@@ -1,24 +1,19 @@
-"""Pictures of trajectories, drawn on the host: MuJoCo scenes, and the navigation room from above."""
+"""Pictures of MuJoCo scenes, drawn on the host, and animations."""
 
 import os
 import sys
 from pathlib import Path
 from typing import BinaryIO
 
-import matplotlib.figure
-import matplotlib.patches
 import mujoco
 import numpy as np
 from jax import Array
-from jaxtyping import Bool, Float, UInt8
-from matplotlib.backends.backend_agg import FigureCanvasAgg
+from jaxtyping import Float, UInt8
 from PIL import Image
 
 from taic_jax.envs.errors import RenderingError
 
 Frames = UInt8[np.ndarray, "T height width 3"]
-
-_FLOOR, _WALL, _GOAL, _POINT = "#f4f1ea", "#3d4451", "#3a9d5d", "#d1495b"
 
 
 def render_mujoco(
@@ -69,57 +64,6 @@ def _make_renderer(model: mujoco.MjModel, height: int, width: int) -> mujoco.Ren
         return mujoco.Renderer(model, height, width)
     except (ImportError, RuntimeError, mujoco.FatalError) as error:
         raise RenderingError(f"cannot draw MuJoCo scenes: {error}") from error
-
-
-def render_room(
-    walls: Float[np.ndarray, "R 4"],
-    standing: Bool[np.ndarray, "T R"],
-    position: Float[Array | np.ndarray, "T 2"],
-    goal: Float[Array | np.ndarray, "T 2"],
-    *,
-    size: float,
-    goal_radius: float,
-    longest_move: float,
-    height: int,
-    width: int,
-) -> Frames:
-    """Draw a point's way through the room [0, size]^2: obstacles, start, goal, and the episode's path so far.
-
-    `standing` says at which ticks a wall is there. A move longer than `longest_move` is a reset: there a new path
-    starts.
-    """
-    dpi = height / 2.4  # lines and dots grow with the frame
-    figure = matplotlib.figure.Figure(figsize=(width / dpi, height / dpi), dpi=dpi, facecolor="white")
-    canvas = FigureCanvasAgg(figure)
-    axes = figure.add_axes((0.02, 0.02, 0.96, 0.96), xlim=(0, size), ylim=(0, size), aspect="equal")
-    axes.set(xticks=[], yticks=[], facecolor=_FLOOR)
-    for spine in axes.spines.values():
-        spine.set(color=_WALL, linewidth=2)
-    patches = [
-        matplotlib.patches.Rectangle((x, y), x_high - x, y_high - y, color=_WALL) for x, y, x_high, y_high in walls
-    ]
-    for patch in patches:
-        axes.add_patch(patch)
-    target = matplotlib.patches.Circle((0, 0), goal_radius, color=_GOAL, alpha=0.6, linewidth=0)
-    axes.add_patch(target)
-    (path,) = axes.plot([], [], color=_POINT, linewidth=1.5, alpha=0.7, solid_capstyle="round")
-    (start,) = axes.plot([], [], "o", markersize=6, markerfacecolor="white", markeredgecolor=_POINT)
-    (point,) = axes.plot([], [], "o", markersize=7, color=_POINT, markeredgecolor="white", clip_on=False)
-    point.set_zorder(9)  # above the walls
-
-    position, goal, begin, frames = np.asarray(position), np.asarray(goal), 0, []
-    for t, here in enumerate(position):
-        if np.abs(here - position[max(t - 1, 0)]).max() > longest_move:
-            begin = t
-        for patch, stands in zip(patches, standing[t], strict=True):
-            patch.set_visible(stands)
-        target.set_center(goal[t])
-        path.set_data(*position[begin : t + 1].T)
-        start.set_data(*position[begin : begin + 1].T)
-        point.set_data(*here[:, None])
-        canvas.draw()
-        frames.append(np.asarray(canvas.buffer_rgba())[..., :3].copy())
-    return np.stack(frames)
 
 
 def write_webp(file: Path | BinaryIO, frames: Frames, dt: float) -> None:

@@ -15,7 +15,7 @@ from taic_jax.envs.views import Signed
 
 @dataclasses.dataclass(frozen=True)
 class Robot:
-    """What a task takes from its body."""
+    """A body and the constants that its tasks take from it."""
 
     mjcf: tuple[str, str]  # package that ships it, path in it
     num_unobserved: int  # leading entries of qpos left out of obs: the place on the ground
@@ -41,7 +41,7 @@ class Robot:
     # MJX's solver and line search; None for the model's own. `experiments.benchmark.worlds --solver` measures them.
     iterations: int | None = None
     ls_iterations: int | None = 4
-    # How obs and action look from the next of `sides` equal sides of the body (see `views`).
+    # Obs and action as seen from the next of `sides` equal sides of the body (see `views`).
     sides: int = 1
     turned_obs: Signed = ()
     turned_action: Signed = ()
@@ -49,10 +49,6 @@ class Robot:
 
 def _brax(name: str) -> tuple[str, str]:
     return "brax", f"envs/assets/{name}.xml"
-
-
-def _gym(name: str) -> tuple[str, str]:
-    return "gymnasium", f"envs/mujoco/assets/{name}.xml"
 
 
 _HALF_CHEETAH = Robot(
@@ -102,13 +98,17 @@ _HOPPER = Robot(
     velocity_limit=10.0,
 )
 _WALKER2D = dataclasses.replace(
-    _HOPPER,
-    mjcf=_brax("walker2d"),
-    healthy_height=(0.8, 2.0),
-    healthy_angle=1.0,
-    healthy_state=math.inf,
+    _HOPPER, mjcf=_brax("walker2d"), healthy_height=(0.8, 2.0), healthy_angle=1.0, healthy_state=math.inf
 )
-_GYM = {"root_height": 0.0, "final_healthy_reward": False, "start_in_default_pose": True}
+_BRAX = {"half_cheetah": _HALF_CHEETAH, "ant": _ANT, "hopper": _HOPPER, "walker2d": _WALKER2D}
+
+
+def _as_in_gym(robot: Robot, file: str) -> Robot:
+    mjcf = "gymnasium", f"envs/mujoco/assets/{file}.xml"
+    return dataclasses.replace(
+        robot, mjcf=mjcf, root_height=0.0, final_healthy_reward=False, start_in_default_pose=True
+    )
+
 
 BODIES = ("gym", "hiro")
 """Of the ant, by the config's `env.body`."""
@@ -116,22 +116,13 @@ BODIES = ("gym", "hiro")
 # By the config's `env.model`. `gym` is Gymnasium's own MJCF, integrator and rules of version 5, without the
 # ant's contact forces, which MJX does not compute and which cost at most 42 an episode.
 ROBOTS: dict[str, dict[str, Robot]] = {
-    "brax": {"half_cheetah": _HALF_CHEETAH, "ant": _ANT, "hopper": _HOPPER, "walker2d": _WALKER2D},
-    "gym": {
-        "half_cheetah": dataclasses.replace(_HALF_CHEETAH, mjcf=_gym("half_cheetah"), **_GYM),
-        "ant": dataclasses.replace(_ANT, mjcf=_gym("ant"), **_GYM),
-        "hopper": dataclasses.replace(_HOPPER, mjcf=_gym("hopper"), **_GYM),
-        "walker2d": dataclasses.replace(_WALKER2D, mjcf=_gym("walker2d_v5"), **_GYM),
-    },
+    "brax": _BRAX,
+    "gym": {name: _as_in_gym(robot, "walker2d_v5" if name == "walker2d" else name) for name, robot in _BRAX.items()},
 }
 
 
 def with_body(ant: Robot, body: str) -> Robot:
-    """Return the ant with the body of `gym`, as it is; or of `hiro`, with a fifth of its strength and longer ticks.
-
-    Raises:
-      UnknownNameError: there is no such body.
-    """
+    """Return the ant with the body of `gym`, as it is; or of `hiro`, with a fifth of its strength and longer ticks."""
     if body not in BODIES:
         raise UnknownNameError("body", body, BODIES)
     if body == "gym":
@@ -148,16 +139,12 @@ def with_body(ant: Robot, body: str) -> Robot:
 
 
 def load_spec(robot: Robot) -> mujoco.MjSpec:
-    """Read the robot's MJCF from the package that ships it, found without importing that (which is slow).
-
-    Raises:
-      MissingExtraError: the package is not installed.
-    """
+    """Read the MJCF from the package that ships it, or raise `MissingExtraError`; importing that would be slow."""
     package, path = robot.mjcf
-    found = importlib.util.find_spec(package)
-    if found is None or found.origin is None:
+    module = importlib.util.find_spec(package)
+    if module is None or module.origin is None:
         raise MissingExtraError(package, "gym" if package == "gymnasium" else None)
-    spec = mujoco.MjSpec.from_file(str(Path(found.origin).parent / path))
+    spec = mujoco.MjSpec.from_file(str(Path(module.origin).parent / path))
     if robot.timestep is not None:
         spec.option.timestep = robot.timestep
     if robot.integrator is not None:
@@ -178,7 +165,7 @@ def compile_spec(spec: mujoco.MjSpec) -> mujoco.MjModel:
 
 
 def initial_qpos(robot: Robot, model: mujoco.MjModel) -> Float[np.ndarray, " nq"]:
-    """Return the pose that the model's custom numeric `init_qpos` holds, else its default pose."""
+    """Return the pose in the model's custom numeric `init_qpos`, else its default pose."""
     index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, "init_qpos")
     if index < 0 or robot.start_in_default_pose:
         return model.qpos0

@@ -1,4 +1,4 @@
-"""Views of a symmetric body: the same motion, told as another of its sides would see it."""
+"""Views of a symmetric body: the same motion, as another of its sides would see it."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 class Views(struct.PyTreeNode):
     """V views, each a signed permutation of the proprioceptive slice [P] and of the action [A].
 
-    The first changes nothing. What is possible in one view is possible in all of them: a simulation commutes with them.
+    The first changes nothing. A motion possible in one view is possible in all: a simulation commutes with them.
     """
 
     obs_order: Array  # [V, P]

@@ -1,5 +1,6 @@
-"""Time limit and automatic reset, kept apart from the tasks' own dynamics."""
+"""Time limit and automatic reset, apart from the tasks' own dynamics."""
 
+import copy
 from typing import Any
 
 import jax
@@ -13,7 +14,7 @@ from taic_jax.envs.views import Views
 
 
 class Wrapper(Env):
-    """An environment around another; whatever it does not define is the inner one's."""
+    """An environment around another; all that it does not define is the inner one's."""
 
     def __init__(self, env: Env):
         self.env = env
@@ -25,13 +26,15 @@ class Wrapper(Env):
 
     @property
     def views(self) -> Views:
-        """Those of the inner environment's body."""
+        """Views of the inner environment's body."""
         return self.env.views
 
     @property
     def evaluated(self) -> Env:
-        """Wrap the inner environment as evaluation sets it."""
-        return type(self)(self.env.evaluated)
+        """This wrapper, with its own settings, around the inner environment as evaluation sets it."""
+        wrapper = copy.copy(self)
+        wrapper.env = self.env.evaluated
+        return wrapper
 
     def reset(self, key: Key[Array, ""]) -> State:
         """Reset the inner environment."""
@@ -57,11 +60,6 @@ class TimeLimit(Wrapper):
         super().__init__(env)
         self.episode_length = ticks
 
-    @property
-    def evaluated(self) -> Env:
-        """Limit the inner environment as evaluation sets it."""
-        return TimeLimit(self.env.evaluated, self.episode_length)
-
     def reset(self, key: Key[Array, ""]) -> State:
         """Reset with the count of ticks at zero."""
         return self.env.reset(key).replace(tick=jnp.zeros((), jnp.int32))
@@ -81,18 +79,13 @@ class TimeLimit(Wrapper):
 class AutoReset(Wrapper):
     """Start the next episode, from a fresh key, in the tick that ends one.
 
-    That tick's reward, terminated, truncated and metrics are kept, and `final_obs` is the observation it
-    ended in; physics, obs and tick are already the next episode's. Ticks in which no episode of the whole
-    batch ends compute no reset, under any nesting of vmap.
+    That tick's reward, terminated, truncated and metrics stay, and `final_obs` is the observation it ended in;
+    physics, obs and tick are already the next episode's. Ticks in which no episode of the whole batch ends compute
+    no reset, under any nesting of vmap.
     """
 
-    def __init__(self, env: Env):
-        super().__init__(env)
-        self._restart = jax.custom_batching.custom_vmap(self._restart_ended)
-        self._restart.def_vmap(self._restart_batched)
-
     def reset(self, key: Key[Array, ""]) -> State:
-        """Reset and keep a key for the episodes to come."""
+        """Reset, with a key for the episodes to come."""
         key, key_reset = jax.random.split(key)
         state = self.env.reset(key_reset)
         return state.replace(key=key, final_obs=state.obs)
@@ -104,6 +97,12 @@ class AutoReset(Wrapper):
         running = (state.physics, state.obs, state.tick)
         physics, obs, tick = self._restart(state.terminated | state.truncated, key_reset, running)
         return state.replace(physics=physics, obs=obs, tick=tick, key=key, final_obs=state.obs)
+
+    def _restart(self, *args: Any) -> Any:
+        """Call `_restart_ended`, under `vmap` once for the whole batch."""
+        restart = jax.custom_batching.custom_vmap(self._restart_ended)
+        restart.def_vmap(self._restart_batched)
+        return restart(*args)
 
     def _restart_ended(self, ended: Array, key: Array, running: Any) -> Any:
         """Put a fresh start where an episode ended; all arguments have the leading axes of `ended`."""
@@ -118,11 +117,10 @@ class AutoReset(Wrapper):
         return jax.lax.cond(jnp.any(ended), restart, lambda ended, key, running: running, ended, key, running)
 
     def _restart_batched(self, axis_size: int, batched: Any, *args: Any) -> tuple[Any, Any]:
-        """Under vmap, ask once for the whole batch: a plain vmap would turn the condition into a select."""
-        args = jax.tree.map(
-            lambda x, has_axis: x if has_axis else jnp.broadcast_to(x, (axis_size, *x.shape)),
-            args,
-            tuple(batched),
-        )
-        running = self._restart(*args)
+        """Decide once for the whole batch: a plain vmap would turn the condition into a select."""
+
+        def broadcast(x: Array, has_axis: bool) -> Array:
+            return x if has_axis else jnp.broadcast_to(x, (axis_size, *x.shape))
+
+        running = self._restart(*jax.tree.map(broadcast, args, tuple(batched)))
         return running, jax.tree.map(lambda _: True, running)

@@ -1,15 +1,74 @@
 """Doors between libraries: others' environments behind `Env`, and ours for theirs; each is loaded when used."""
 
-from taic_jax.envs.adapters.brax import BRAX_PREFIX, BraxEnv, to_brax
-from taic_jax.envs.adapters.gymnasium import to_gymnasium, to_gymnasium_vector
+from typing import TYPE_CHECKING
+
+from taic_jax.envs.adapters.admission import extra
+from taic_jax.envs.adapters.brax import BRAX_PREFIX, BraxEnv
 from taic_jax.envs.adapters.playground import PLAYGROUND_PREFIX, PlaygroundEnv
+from taic_jax.envs.base import Env
+from taic_jax.envs.third_party import third_party
+
+if TYPE_CHECKING:
+    from taic_jax.envs.adapters.brax_export import BraxExport
+    from taic_jax.envs.adapters.gymnasium_export import GymnasiumExport, GymnasiumVectorExport
 
 __all__ = [
-    "BRAX_PREFIX",
-    "PLAYGROUND_PREFIX",
-    "BraxEnv",
-    "PlaygroundEnv",
-    "to_brax",
-    "to_gymnasium",
-    "to_gymnasium_vector",
-]
+    "BRAX_PREFIX", "PLAYGROUND_PREFIX", "BraxEnv", "PlaygroundEnv", "to_brax", "to_gymnasium", "to_gymnasium_vector",
+]  # fmt: skip
+
+
+def to_brax(env: Env) -> "BraxExport":
+    """Turn an environment of ours into a `brax.envs.Env`, for Brax's wrappers and trainers.
+
+    Brax counts the ticks, in its `EpisodeWrapper`, so a `TimeLimit` around `env` is taken off; its number is
+    still there as `episode_length`, to be passed on: `training.wrap(to_brax(env), env.episode_length)`. At an
+    episode's end Brax goes back to the copy's first state, so starts do not vary, nor does a task's `restart` act.
+    With JAX 0.10, Brax 0.14.2's PPO stops, for any environment, at a function that JAX took away
+    (`device_put_replicated`); its wrappers work.
+
+    Raises:
+      AdapterError: `env` is none of ours, resets itself, or has its time limit inside another wrapper.
+    """
+    with third_party():
+        from taic_jax.envs.adapters.brax_export import BraxExport
+
+    return BraxExport(env)
+
+
+def to_gymnasium(env: Env, render_mode: str | None = None) -> "GymnasiumExport":
+    """Turn an environment of ours into a `gymnasium.Env`: NumPy in and out, compiled, info holding the metrics.
+
+    `truncated` comes from the `TimeLimit` that `make_env` puts around a task.
+
+    Args:
+      env: an environment of ours.
+      render_mode: `rgb_array`, or None for no pictures.
+
+    Raises:
+      MissingExtraError: Gymnasium is not installed.
+      UnknownNameError: there is no such render mode.
+      AdapterError: `env` is none of ours, or resets itself.
+    """
+    with extra("gym"):
+        from taic_jax.envs.adapters.gymnasium_export import GymnasiumExport
+
+    return GymnasiumExport(env, render_mode)
+
+
+def to_gymnasium_vector(env: Env, num_envs: int, render_mode: str | None = None) -> "GymnasiumVectorExport":
+    """Turn an environment of ours into a `gymnasium.vector.VectorEnv` of N copies in one compiled program.
+
+    An episode that ends is followed by the next in the same tick (`AutoresetMode.SAME_STEP`): obs is the next
+    episode's first, and infos hold the last one's `final_obs` and, as `final_info`, its metrics. Arguments and
+    errors are those of `to_gymnasium`, besides:
+
+    Args:
+      num_envs: N, at least 1.
+
+    Raises:
+      AdapterError: `num_envs` is not a positive integer.
+    """
+    with extra("gym"):
+        from taic_jax.envs.adapters.gymnasium_export import GymnasiumVectorExport
+
+    return GymnasiumVectorExport(env, num_envs, render_mode)

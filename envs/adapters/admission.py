@@ -1,4 +1,4 @@
-"""What an adapter asks of an environment before it lets it through, each refused in one line."""
+"""Conditions on an environment that passes an adapter, each refused in one line."""
 
 import contextlib
 from collections.abc import Iterator
@@ -14,11 +14,7 @@ from taic_jax.envs.errors import AdapterError, MissingExtraError
 
 @contextlib.contextmanager
 def extra(name: str) -> Iterator[None]:
-    """Import packages of an extra of ours.
-
-    Raises:
-      MissingExtraError: one of them is not installed; the message gives the line that installs it.
-    """
+    """Import packages of an extra of ours; `MissingExtraError` with the line that installs it where one is missing."""
     try:
         yield
     except ModuleNotFoundError as error:
@@ -26,15 +22,9 @@ def extra(name: str) -> Iterator[None]:
 
 
 def require_vector_actions(name: str, env: Any, limits: Float[np.ndarray, "A 2"] | None = None) -> None:
-    """Refuse actions that a vector in [-1, 1]^A cannot stand for.
+    """Raise `AdapterError` at actions that a vector in [-1, 1]^A cannot stand for: discrete, composite or unlimited.
 
-    Args:
-      name: the environment's, for the message.
-      env: any library's environment; its `action_space` is looked at where it has one.
-      limits: of every action, low and high; None if they are not known.
-
-    Raises:
-      AdapterError: the actions are discrete, composite or without limits.
+    `limits` are low and high of every action; without them, those of the environment's `action_space` are read.
     """
     space: Any = getattr(env, "action_space", None)
     if any(hasattr(space, attribute) for attribute in ("n", "nvec", "spaces")):
@@ -47,23 +37,10 @@ def require_vector_actions(name: str, env: Any, limits: Float[np.ndarray, "A 2"]
         raise AdapterError(f"{name}: actions: action {index} is in [{low}, {high}], expected finite limits")
 
 
-def require_vector_obs(name: str, obs: Any) -> int:
-    """Return the length of an abstract observation.
-
-    Raises:
-      AdapterError: it is not one vector.
-    """
-    if len(getattr(obs, "shape", ())) != 1:
-        shapes = jax.tree.map(lambda leaf: leaf.shape, obs)
-        raise AdapterError(f"{name}: obs: got the shapes {shapes}, expected one vector [S]")
-    return obs.shape[0]
-
-
 def require_task(adapter: str, env: Any) -> State:
     """Return the abstract first state of one of our environments that shall leave through an adapter.
 
-    Raises:
-      AdapterError: it is none of ours, or starts the next episode by itself, which the other side does.
+    Raise `AdapterError` if it is none of ours, or starts the next episode by itself, which the other side does.
     """
     require_vector_actions(adapter, env)
     if not isinstance(env, Env):
@@ -73,9 +50,3 @@ def require_task(adapter: str, env: Any) -> State:
     if start.key is not None:
         raise AdapterError(f"{adapter}: {env.name} is in AutoReset, expected the environment inside it")
     return start
-
-
-def strong(tree: Any) -> Any:
-    """Make every dtype strong, for a carry that is the same after reset and step."""
-    arrays = jax.tree.map(jax.numpy.asarray, tree)
-    return jax.tree.map(lambda leaf: jax.lax.convert_element_type(leaf, leaf.dtype), arrays)

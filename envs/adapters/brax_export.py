@@ -1,5 +1,6 @@
 """Our environments as Brax's; imports Brax."""
 
+from operator import attrgetter
 from typing import Any
 
 import jax
@@ -19,6 +20,10 @@ class BraxExport(base.Env):
     `pipeline_state` is our `physics`, and `done` says that the task itself ended. Actions are clipped to [-1, 1].
     """
 
+    observation_size = property(attrgetter("env.observation_size"))
+    action_size = property(attrgetter("env.action_size"))
+    backend = property(lambda self: "taic_jax")  # the physics is no pipeline of Brax's
+
     def __init__(self, env: Env):
         require_task("to_brax", env)
         self.episode_length = env.episode_length  # ticks
@@ -33,33 +38,11 @@ class BraxExport(base.Env):
         self.env = env
         self._metrics = tuple(start.metrics)
 
-    @property
-    def observation_size(self) -> int:
-        """Return the length of the observation."""
-        return self.env.observation_size
-
-    @property
-    def action_size(self) -> int:
-        """Return the length of the action."""
-        return self.env.action_size
-
-    @property
-    def backend(self) -> str:
-        """Return where the physics comes from; no pipeline of Brax's."""
-        return "taic_jax"
-
     def reset(self, rng: Array) -> base.State:
         """Reset under one of Brax's raw keys [2] uint32, or under a typed one."""
         typed = jnp.issubdtype(rng.dtype, jax.dtypes.prng_key)
         state = self.env.reset(rng if typed else jax.random.wrap_key_data(rng))
-        return base.State(
-            pipeline_state=state.physics,
-            obs=state.obs,
-            reward=state.reward,
-            done=_done(state),
-            metrics=dict(state.metrics),
-            info={},
-        )
+        return base.State(**_fields(state), metrics=dict(state.metrics), info={})
 
     def step(self, state: Any, action: Array) -> base.State:
         """Step; what Brax's wrappers have put into metrics and info stays there."""
@@ -72,14 +55,9 @@ class BraxExport(base.Env):
             metrics={name: state.metrics[name] for name in self._metrics},
         )
         after = self.env.step(before, jnp.clip(action, -1.0, 1.0))
-        return state.replace(
-            pipeline_state=after.physics,
-            obs=after.obs,
-            reward=after.reward,
-            done=_done(after),
-            metrics={**state.metrics, **after.metrics},
-        )
+        return state.replace(**_fields(after), metrics={**state.metrics, **after.metrics})
 
 
-def _done(state: State) -> Array:
-    return (state.terminated | state.truncated).astype(jnp.float32)
+def _fields(state: State) -> dict[str, Any]:
+    done = (state.terminated | state.truncated).astype(jnp.float32)
+    return {"pipeline_state": state.physics, "obs": state.obs, "reward": state.reward, "done": done}

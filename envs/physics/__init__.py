@@ -28,7 +28,7 @@ def make_physics(
       substeps: engine steps a tick.
       backend: `mujoco` (C engine, host's cores), `mjx` (JAX), `warp` (MJX on MuJoCo Warp, NVIDIA only), or `auto`:
         `mujoco` where JAX runs on CPU, else `mjx`.
-      num_threads: threads of the `mujoco` backend; 0 takes one per physical core.
+      num_threads: threads of the `mujoco` backend; 0 shares the physical cores between JAX's devices.
       iterations: solver iterations on `mjx` and `warp`, None for the model's own.
       ls_iterations: line-search iterations likewise.
 

@@ -1,4 +1,4 @@
-"""What a task asks of a backend."""
+"""The interface of a physics backend."""
 
 import abc
 

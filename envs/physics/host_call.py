@@ -1,9 +1,9 @@
 """Calls from compiled programs into Python on the host, by a name that stays the same from process to process.
 
-JAX's own callbacks are baked into a program as an address, so no program with one can be kept in the persistent
+JAX's own callbacks are baked into a program as an address, so no program with one can stay in the persistent
 compilation cache. Here a function is a handler of XLA's foreign function interface. Its C structures (those of
-`xla/ffi/api/c_api.h`, extended only at their ends) are read by ctypes, as words: nothing needs to be compiled. XLA is
-given the version at which they were read and refuses a handler whose version it no longer serves.
+`xla/ffi/api/c_api.h`, extended only at their ends) are read by ctypes, as words: nothing needs to be compiled. A
+handler names the version at which they were read, and XLA refuses one whose version it no longer serves.
 """
 
 import ctypes
@@ -39,9 +39,9 @@ class HostCall:
     """A function on the host that compiled programs on the CPU call by its name; keep it for as long as they live.
 
     Args:
-      name: not used before in this process. Programs in the persistent cache look for it, so it must tell what
+      name: not used before in this process. Programs in the persistent cache look for it, so it must name all that
         the function does.
-      function: what to call, maybe from several threads at once. It must not call JAX, which can deadlock.
+      function: called maybe from several threads at once. It must not call JAX, which can deadlock.
 
     Raises:
       RuntimeError: XLA no longer serves `API_VERSION`.
@@ -62,7 +62,7 @@ class HostCall:
         frame = _words(address, _RESULTS + 1)
         if frame[_EXTENSION]:
             extension = _words(frame[_EXTENSION], _EXTENDED + 1)
-            if extension[_EXTENSION_TYPE] & 0xFFFFFFFF == _METADATA:  # asked once, at registration
+            if extension[_EXTENSION_TYPE] & 0xFFFFFFFF == _METADATA:  # once, at registration
                 major, minor = API_VERSION
                 _words(extension[_EXTENDED], _METADATA_VERSION + 1)[_METADATA_VERSION] = major | minor << 32
                 return None
@@ -75,9 +75,9 @@ class HostCall:
 
 @functools.cache
 def host_calls_work() -> bool:
-    """Return whether XLA calls the host as this module expects, by one call of known answer and one that must fail.
+    """Return whether XLA calls the host as this module expects, with a line on standard error where it does not.
 
-    Where it does not, say so in one line on standard error.
+    Try one call whose answer is certain and one that must fail.
     """
     try:
         cpu, *_ = jax.local_devices(backend="cpu")
@@ -127,7 +127,7 @@ def _array(buffers: int) -> np.ndarray:
 
 
 def _as_error(api: int, message: str) -> int:
-    """Have XLA make an error with that message."""
+    """Return an error of XLA's with that message."""
     text = ctypes.c_char_p(message.encode())
-    told = (ctypes.c_int64 * 4)(32, 0, ctypes.cast(text, ctypes.c_void_p).value or 0, _INTERNAL)
-    return _Handler(_words(api, _CREATE_ERROR + 1)[_CREATE_ERROR])(ctypes.addressof(told)) or 0
+    arguments = (ctypes.c_int64 * 4)(32, 0, ctypes.cast(text, ctypes.c_void_p).value or 0, _INTERNAL)
+    return _Handler(_words(api, _CREATE_ERROR + 1)[_CREATE_ERROR])(ctypes.addressof(arguments)) or 0

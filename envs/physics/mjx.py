@@ -24,13 +24,9 @@ _WARP_CAPACITY = {"naconmax": 32 * 8192, "njmax": 200}
 class MjxPhysics(Physics):
     """Steps of MJX on a template `mjx.Data`, of which only `PhysicsState` and the controls change.
 
-    Args:
-      model: compiled model.
-      substeps: engine steps a tick.
-      iterations: solver iterations instead of the model's. Fewer are faster and soon wrong: with a single
-        one, the ant's joint velocities are off by 10 rad/s within a tick.
-      ls_iterations: line-search iterations instead of the model's; 4 change nothing measurable.
-      warp: let MuJoCo Warp compute the steps.
+    Fewer solver iterations are faster and soon wrong: with a single one, the ant's joint velocities are off by
+    10 rad/s within a tick. Of the line search, 4 iterations change nothing measurable. For the arguments see
+    `make_physics`.
 
     Raises:
       MissingExtraError: for `warp`, its package is not installed or JAX has no NVIDIA device.
@@ -45,9 +41,9 @@ class MjxPhysics(Physics):
         *,
         warp: bool = False,
     ):
-        super().__init__(model, substeps)
         if warp:
             _require_warp()
+        super().__init__(model, substeps)
         impl = "warp" if warp else "jax"
         with third_party():
             mjx_model = mjx.put_model(model, impl=impl)
@@ -79,4 +75,4 @@ def _require_warp() -> None:
         raise BackendError("warp", f"an NVIDIA GPU, and JAX runs on {jax.default_backend()}")
     import warp
 
-    warp.config.log_level = warp.LOG_WARNING  # below, it tells of each kernel that it loads
+    warp.config.log_level = warp.LOG_WARNING  # below, it prints a line for each kernel that it loads

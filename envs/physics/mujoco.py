@@ -19,21 +19,13 @@ from taic_jax.envs.physics.base import Physics
 from taic_jax.envs.physics.host_call import HostCall, host_calls_work
 from taic_jax.envs.physics.watchdog import Watchdog
 
-# What a call sends, in the order of MuJoCo's state rows, where only the time precedes it.
-_SENT = (
-    mujoco.mjtState.mjSTATE_QPOS.value
-    | mujoco.mjtState.mjSTATE_QVEL.value
-    | mujoco.mjtState.mjSTATE_WARMSTART.value
-    | mujoco.mjtState.mjSTATE_CTRL.value
-)
+# Contents of a call, in the order of MuJoCo's state rows, where only the time precedes it.
+_STATE, _WARNING = mujoco.mjtState, mujoco.mjtWarning
+_SENT = sum(x.value for x in (_STATE.mjSTATE_QPOS, _STATE.mjSTATE_QVEL, _STATE.mjSTATE_WARMSTART, _STATE.mjSTATE_CTRL))
 # After these warnings MuJoCo has put the simulation back to its initial pose.
-_DIVERGED = [
-    mujoco.mjtWarning.mjWARN_BADQPOS.value,
-    mujoco.mjtWarning.mjWARN_BADQVEL.value,
-    mujoco.mjtWarning.mjWARN_BADQACC.value,
-]
+_DIVERGED = [x.value for x in (_WARNING.mjWARN_BADQPOS, _WARNING.mjWARN_BADQVEL, _WARNING.mjWARN_BADQACC)]
 PATIENCE = 60.0
-"""Seconds after which a call that has not returned is told; the longest of ours take a tenth of one."""
+"""Seconds after which a call that has not returned is reported; the longest of ours take a tenth of one."""
 LATE = (
     f"the physics has not returned for {PATIENCE:.0f} s. If it never does: end the process (kill -9), go on from the "
     "last checkpoint (--resume), and should it happen again, step with one thread (--env.num-threads 1)"
@@ -43,16 +35,11 @@ LATE = (
 class MujocoPhysics(Physics):
     """A host call of `mujoco.batch.Batch`; all leading axes (seeds, environments) are one engine call.
 
-    It is pure: what the engine keeps between calls is scratch. Each call overwrites every state field that
+    It is pure: the engine's own memory between calls is scratch. Each call overwrites every state field that
     `mj_step` reads (qpos, qvel, qacc_warmstart, ctrl). The others never change: models with activations,
     mocap bodies, plugins or equalities are refused, no forces are applied, and the time enters no force. So
     the result depends on the arguments alone, at any number of threads. A simulation that diverges comes back
-    as NaN.
-
-    Args:
-      model: compiled model; what changes in it later has no effect.
-      substeps: engine steps a tick.
-      num_threads: threads that step simulations; 0 shares the physical cores between JAX's devices.
+    as NaN. Later changes of the model have no effect. For the arguments see `make_physics`.
 
     Raises:
       ValueError: if the model has state that `PhysicsState` does not carry.
@@ -63,35 +50,28 @@ class MujocoPhysics(Physics):
             raise ValueError("the model must have no activations, mocap bodies, plugins or equalities")
         super().__init__(model, substeps)
         self.num_threads = num_threads or max(1, num_physical_cores() // jax.local_device_count())
-        self.engine = _engine(_as_bytes(model), substeps, self.num_threads)
+        saved = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+        mujoco.mj_saveModel(model, None, saved)
+        self.engine = _engine(saved.tobytes(), substeps, self.num_threads)
 
     def step(self, state: PhysicsState, ctrl: Float[Array, " nu"]) -> PhysicsState:
         """Advance by one tick under constant controls."""
         nq, nv = self.model.nq, self.model.nv
         sent = jnp.concatenate([state.qpos, state.qvel, state.qacc_warmstart, ctrl])
-        here = self._step_elsewhere if self.engine.call is None else self._step_here
-        after = jax.lax.platform_dependent(sent, cpu=here, default=self._step_elsewhere)
-        return state.replace(qpos=after[:nq], qvel=after[nq : nq + nv], qacc_warmstart=after[nq + nv :])
-
-    def _step_here(self, sent: Float[Array, " n"]) -> Float[Array, " m"]:
-        """Step in XLA's own memory: on CPU, where `pure_callback` takes ten times as long to hand arrays over."""
-        assert self.engine.call is not None
-        return self.engine.call(sent, self.engine.num_returned)
-
-    def _step_elsewhere(self, sent: Float[Array, " n"]) -> Float[Array, " m"]:
-        """Step simulations whose state comes from an accelerator, or where XLA refuses our host calls."""
+        # `pure_callback` serves accelerators and an XLA that refuses our host calls. On CPU it takes ten times as long
+        # to hand arrays over as a host call, which steps in XLA's own memory.
         shape = jax.ShapeDtypeStruct((self.engine.num_returned,), jnp.float32)
-        return jax.pure_callback(self.engine.copied_step, shape, sent, vmap_method="broadcast_all")
+        elsewhere = functools.partial(jax.pure_callback, self.engine.copied_step, shape, vmap_method="broadcast_all")
+        call = self.engine.call
+        here = elsewhere if call is None else functools.partial(call, size=self.engine.num_returned)
+        after = jax.lax.platform_dependent(sent, cpu=here, default=elsewhere)
+        return state.replace(qpos=after[:nq], qvel=after[nq : nq + nv], qacc_warmstart=after[nq + nv :])
 
 
 class Engine:
-    """What steps a model's simulations on the host: any number in one call, in any number of threads at once.
+    """Steps of a model's simulations on the host: any number in one call, and calls from any number of threads.
 
-    Args:
-      name: of its host call; no other engine has it.
-      model: its own.
-      substeps: engine steps a tick.
-      num_threads: of each call.
+    No other engine's host call has its name, and nothing else changes its model.
     """
 
     def __init__(self, name: str, model: mujoco.MjModel, substeps: int, num_threads: int):
@@ -134,12 +114,6 @@ def _engine(model: bytes, substeps: int, num_threads: int) -> Engine:
     digest = hashlib.sha256(model).hexdigest()[:16]
     loaded = mujoco.MjModel.from_binary_path("model.mjb", {"model.mjb": model})
     return Engine(f"taic_jax_mujoco_{digest}_{substeps}_{num_threads}", loaded, substeps, num_threads)
-
-
-def _as_bytes(model: mujoco.MjModel) -> bytes:
-    saved = np.empty(mujoco.mj_sizeModel(model), np.uint8)
-    mujoco.mj_saveModel(model, None, saved)
-    return saved.tobytes()
 
 
 def num_physical_cores() -> int:

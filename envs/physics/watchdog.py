@@ -7,14 +7,10 @@ import weakref
 
 
 class Watchdog:
-    """A context around calls; one that takes longer than `limit` seconds is told on standard error, once.
+    """A context around calls; one that takes longer than `limit` seconds gets `message` on standard error, once.
 
     Several threads may be in it. One more looks on from the first call until the watchdog is no longer used. It costs a
     call two assignments.
-
-    Args:
-      limit: in seconds.
-      message: what to say.
     """
 
     def __init__(self, limit: float, message: str):
@@ -31,22 +27,22 @@ class Watchdog:
     def __exit__(self, *_: object) -> None:
         del self._since[threading.get_ident()]
 
-    def late(self, told: float | None) -> float | None:
-        """Return when the longest running call began if it is late, having told of it unless that is `told`."""
+    def late(self, reported: float | None) -> float | None:
+        """Return when the longest running call began if it is late; report it too, unless that is `reported`."""
         since = min(self._since.copy().values(), default=None)
         if since is None or time.monotonic() - since < self.limit:
             return None
-        if since != told:
+        if since != reported:
             print(f"taic_jax: {self.message}", file=sys.stderr, flush=True)
         return since
 
 
 def _look_on(watchdog: "weakref.ref[Watchdog]", interval: float) -> None:
-    told = None
+    reported = None
     while True:
         time.sleep(interval)
         watched = watchdog()
         if watched is None:
             return
-        told = watched.late(told)
+        reported = watched.late(reported)
         del watched  # or it would never be collected

@@ -181,7 +181,7 @@ def test_near_goal_is_straight_ahead_and_the_fixed_one_behind_a_wall():
         np.testing.assert_allclose(state.reward, [0, -16], atol=0.1)
         np.testing.assert_array_equal(state.metrics["success"], [1, 0])
     with pytest.raises(UnknownNameError, match="goal"):
-        AntArena("ant_push", PUSH, goal="near")
+        AntArena("ant_push", PUSH, "gym", goal="near")
 
 
 @pytest.mark.parametrize("name", ["ant", "ant_maze"])

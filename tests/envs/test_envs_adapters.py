@@ -19,8 +19,8 @@ from brax import envs as brax_envs
 from ml_collections import ConfigDict
 
 from taic_jax.envs.adapters import BraxEnv, PlaygroundEnv, to_brax
-from taic_jax.envs.adapters.admission import require_task, require_vector_actions, require_vector_obs
-from taic_jax.envs.adapters.playground import PlaygroundPhysics
+from taic_jax.envs.adapters.admission import require_task, require_vector_actions
+from taic_jax.envs.adapters.foreign import ForeignPhysics
 from taic_jax.envs.contract import check_contract
 from taic_jax.envs.errors import AdapterError, MissingExtraError
 from taic_jax.envs.third_party import third_party
@@ -46,7 +46,7 @@ def test_adapter_is_braxs_own_step():
     np.testing.assert_array_equal(ours.obs, expected.obs)
     np.testing.assert_array_equal(ours.reward, expected.reward)
     np.testing.assert_array_equal(ours.terminated, expected.done.astype(bool))
-    np.testing.assert_array_equal(ours.physics.pipeline_state.q, expected.pipeline_state.q)
+    np.testing.assert_array_equal(ours.physics.simulation.q, expected.pipeline_state.q)
     assert ours.terminated.any() and not ours.truncated.any()
     assert env.episode_length == 1000 and env.dt == 0.02
 
@@ -146,9 +146,7 @@ REFUSALS = {
     "here: actions: action 0 is in [-inf, inf], expected finite limits": lambda: require_vector_actions(
         "here", ENDLESS
     ),
-    "here: obs: got the shapes {'a': (2,)}, expected one vector [S]": lambda: require_vector_obs(
-        "here", {"a": jnp.zeros(2)}
-    ),
+    "brax:parts: obs: got the shapes {'a': (2,)}, expected one vector [S]": lambda: BraxEnv("parts"),
     "brax:swimmer: the pipeline 'spring' does not fit: Unsupported backend: spring.": lambda: BraxEnv("swimmer"),
     "brax:dice: actions: got Discrete(6), expected one vector of numbers with limits": lambda: BraxEnv("dice"),
     "brax:free: actions: action 1 is in [-inf, 1.0], expected finite limits": lambda: BraxEnv("free"),
@@ -161,6 +159,8 @@ def test_what_does_not_fit_is_told_in_one_line(message, monkeypatch):
     free = SimpleNamespace(sys=SimpleNamespace(actuator=actuator))
     monkeypatch.setitem(brax_envs._envs, "dice", lambda backend: DISCRETE)
     monkeypatch.setitem(brax_envs._envs, "free", lambda backend: free)
+    start = brax_envs.State(None, {"a": jnp.zeros(2)}, jnp.zeros(()), jnp.zeros(()))
+    monkeypatch.setitem(brax_envs._envs, "parts", lambda backend: SimpleNamespace(reset=lambda key: start))
     with pytest.raises(AdapterError) as caught:
         REFUSALS[message]()
     assert str(caught.value) == message
@@ -206,7 +206,7 @@ def test_playground_adapter_is_playgrounds_own_step(playground):
     np.testing.assert_array_equal(ours.obs, expected.obs)
     np.testing.assert_array_equal(ours.reward, expected.reward)
     np.testing.assert_array_equal(ours.terminated, expected.done.astype(bool))
-    np.testing.assert_array_equal(ours.physics.data.qpos, expected.data.qpos)
+    np.testing.assert_array_equal(ours.physics.simulation.qpos, expected.data.qpos)
     assert (env.name, env.action_size, env.episode_length, env.dt) == ("playground:PendulumSwingup", 1, 1000, 0.02)
     assert env.observation_size == env.proprioceptive_size == 3
     check_contract(env)
@@ -264,7 +264,7 @@ def test_pictures_show_where_playgrounds_targets_are(monkeypatch, playground):
     places[2] = [[0.3, 0.0, 0.0]]
     data = SimpleNamespace(qpos=np.zeros((3, 1)), mocap_pos=places)
     try:
-        frames = PlaygroundEnv("Parts").render(PlaygroundPhysics(data, {}, {}), height=60, width=80)
+        frames = PlaygroundEnv("Parts").render(ForeignPhysics(data, {}, {}), height=60, width=80)
     except RenderingError as error:
         pytest.skip(str(error))
     assert frames.shape == (3, 60, 80, 3) and frames.dtype == np.uint8

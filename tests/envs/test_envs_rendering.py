@@ -9,8 +9,7 @@ import pytest
 from PIL import ImageColor
 
 from taic_jax.envs import Navigation, RenderingError, make_env, rendering
-from taic_jax.envs.navigation import NavigationState
-from taic_jax.envs.rendering import _GOAL, _POINT, _WALL
+from taic_jax.envs.navigation import _GOAL, _POINT, _WALL, NavigationState
 
 
 def near(frame, colour: str):
