@@ -86,14 +86,14 @@ def save_json(path: Path, tree: Any) -> None:
     save_text(path, json.dumps(tree, indent=2, allow_nan=False) + "\n")
 
 
-def save_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+def save_table(path: Path, rows: Sequence[Mapping[str, Any]], newline: str = "\n") -> None:
     """Write rows with the same columns as CSV, whole or not at all.
 
     Raises:
         SaveError: it cannot be written.
     """
     text = io.StringIO(newline="")
-    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+    writer = csv.DictWriter(text, list(rows[0]), lineterminator=newline)
     writer.writeheader()
     writer.writerows(rows)
     save_text(path, text.getvalue())

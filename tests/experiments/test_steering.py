@@ -12,7 +12,7 @@ from written_runs import write_options, write_run
 
 from taic_jax.envs import State
 from taic_jax.envs.base import PhysicsState
-from taic_jax.experiments import steering
+from taic_jax.experiments.evidence import steering
 
 
 class Sliding(Probe):
@@ -66,7 +66,7 @@ def test_options_of_real_ants_are_measured(tmp_path, monkeypatch):
     config = with_fields(CONFIG, env__name="ant")
     run, out = write_run(tmp_path / "ant" / "tiny", config), tmp_path / "steering.csv"
     write_options(run, config, experience=False)
-    steering.main([str(run), "--out", str(out)])
+    assert steering.main([str(run), "--out", str(out)]) == 0
     with out.open() as file:
         rows = {row["measure"]: row for row in csv.DictReader(file)}
     assert {(row["run"], row["seeds"], row["length"]) for row in rows.values()} == {("ant/tiny", "2", "2")}
@@ -88,14 +88,12 @@ def test_what_cannot_be_steered_is_refused(task, options, message, tmp_path, cap
     run = write_run(tmp_path / "run", config)
     if options:
         write_options(run, config, experience=False)
-    with pytest.raises(SystemExit) as stop:
-        steering.main([str(run), "--out", str(tmp_path / "steering.csv")])
-    assert stop.value.code == 2 and message in capsys.readouterr().err
+    assert steering.main([str(run), "--out", str(tmp_path / "steering.csv")]) == 2
+    assert message in capsys.readouterr().err
     assert not (tmp_path / "steering.csv").exists()
 
 
 def test_no_run_is_refused(tmp_path, capsys):
-    with pytest.raises(SystemExit) as stop:
-        steering.main(["--out", str(tmp_path / "steering.csv")])
-    assert stop.value.code == 2 and "expected the folder of at least one run, got none" in capsys.readouterr().err
+    assert steering.main(["--out", str(tmp_path / "steering.csv")]) == 2
+    assert "expected the folder of at least one run, got none" in capsys.readouterr().err
     assert not (tmp_path / "steering.csv").exists()

@@ -1,6 +1,6 @@
 """Whether codes steer: where an ant goes while one is held, and whether it goes elsewhere under another.
 
-python -m taic_jax.experiments.steering RUN... --out FILE
+python -m taic_jax.experiments.evidence.steering RUN... --out FILE
 
 Takes the options of finished runs, draws codes from the prior, and writes a row per run and measure.
 """
@@ -23,15 +23,14 @@ from taic_jax.analysis.option_space import always
 from taic_jax.artifacts.models import load_options
 from taic_jax.command_line import tell
 from taic_jax.config import ConfigError
-from taic_jax.config_io import load_config
 from taic_jax.envs.ant_tasks import upside_down
 from taic_jax.envs.base import Env, State
 from taic_jax.envs.wrappers import AutoReset, Wrapper
-from taic_jax.experiments.drawing import RESULTS
-from taic_jax.experiments.figure7 import with_interval, write_numbers
+from taic_jax.experiments.evidence.numbers import with_interval, write_numbers
+from taic_jax.experiments.evidence.table import RESULTS
 from taic_jax.options.execution import Executor, make_executor
 from taic_jax.rl.rollout import RolloutCarry, rollout, start
-from taic_jax.runtime.checkpoint import ArtifactError
+from taic_jax.runtime.run_folder import RunFolder
 from taic_jax.tasks import make_envs
 from taic_jax.types import as_arrays
 
@@ -39,7 +38,6 @@ CODES, STARTS = 64, 8
 """Codes of each model, and the starts that each is held from."""
 SECONDS = 3.0
 """For which a code is held."""
-FIELDS = ("run", "seeds", "length", "measure", "iqm", "low", "high", "per_seed")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -119,7 +117,7 @@ def steering_of(folder: Path) -> tuple[int, dict[str, np.ndarray]]:
       ConfigError: its robot cannot go in every direction.
       ArtifactError: there are no options.
     """
-    config = load_config(str(folder / "config.yaml"))
+    config = RunFolder(folder).config()
     _, env = make_envs(config)
     robot: Any = getattr(env, "model", None)
     if robot is None or robot.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE:
@@ -135,24 +133,23 @@ def steering_of(folder: Path) -> tuple[int, dict[str, np.ndarray]]:
     return config.options.length, {name: np.array([row[name] for row in measured]) for name in measured[0]}
 
 
-def main(args: Sequence[str] | None = None) -> None:
-    """Measure, write the rows and print them."""
-    arguments = tyro.cli(Arguments, args=args)
+def write_measures(arguments: Arguments) -> None:
+    """Measure the runs, and write the rows."""
+    if not arguments.runs:
+        raise ConfigError("expected the folder of at least one run, got none")
     rows = []
-    try:
-        if not arguments.runs:
-            raise ConfigError("expected the folder of at least one run, got none")
-        for folder in arguments.runs:
-            length, measures = steering_of(folder)
-            run = "/".join(folder.parts[-2:])
-            for name, values in measures.items():
-                row = {"run": run, "seeds": len(values), "length": length, "measure": name, "per_seed": values}
-                rows.append(row | with_interval(values))
-    except (ConfigError, ArtifactError) as error:
-        print(f"steering: {error}", file=sys.stderr)
-        raise SystemExit(2) from None
-    write_numbers(rows, FIELDS, arguments.out)
+    for folder in arguments.runs:
+        length, measures = steering_of(folder)
+        for name, values in measures.items():
+            row = {"run": "/".join(folder.parts[-2:]), "seeds": len(values), "length": length, "measure": name}
+            rows.append(row | with_interval(values) | {"per_seed": values})
+    write_numbers(rows, arguments.out)
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Measure runs, and return the exit code."""
+    return tell(lambda: write_measures(tyro.cli(Arguments, args=args)))
 
 
 if __name__ == "__main__":
-    sys.exit(tell(main))
+    sys.exit(main())
