@@ -33,9 +33,7 @@ MEASURES = {
     "effect of dimension 0": "effect/0",
     "effect of dimension 1": "effect/1",
 }
-FIELDS = (
-    "task", "method", "seeds", "measure", "value", "low", "high", "again", "again_low", "again_high", "within", "p",
-)  # fmt: skip
+OURS, THEIRS = ("again", "again_low", "again_high"), ("value", "low", "high")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,14 +69,15 @@ def compare(ours: EvidenceRows, theirs: EvidenceRows) -> list[dict[str, Any]]:
     for measure, name in MEASURES.items():
         if name in theirs.numbers:
             values, fresh = theirs.numbers[name], ours.numbers[name]
-            line = {"measure": measure} | with_interval(values, ("value", "low", "high"))
-            line |= with_interval(fresh, ("again", "again_low", "again_high"))
-            lines.append(line | {"p": float(stats.mannwhitneyu(values, fresh).pvalue)})
+            p = float(stats.mannwhitneyu(values, fresh).pvalue)
+            lines.append((measure, with_interval(values, THEIRS) | with_interval(fresh, OURS), p))
     if "success_after" in theirs.numbers:
-        lines.append({"measure": "recovered"} | share(theirs, ("value", "low", "high"))
-                     | share(ours, ("again", "again_low", "again_high")))  # fmt: skip
+        lines.append(("recovered", share(theirs, THEIRS) | share(ours, OURS), ""))
     name = {"task": theirs.task, "method": theirs.method, "seeds": len(theirs.seeds)}
-    return [name | line | {"within": line["low"] <= line["again"] <= line["high"]} for line in lines]
+    return [
+        name | {"measure": measure} | line | {"within": line["low"] <= line["again"] <= line["high"], "p": p}
+        for measure, line, p in lines
+    ]
 
 
 def share(runs: EvidenceRows, names: Sequence[str]) -> dict[str, float]:
@@ -89,14 +88,12 @@ def share(runs: EvidenceRows, names: Sequence[str]) -> dict[str, float]:
 
 def write_comparison(arguments: Arguments) -> None:
     """Write the comparison, and how much of it came out again."""
-    lines = []
     committed, fresh = read_table(arguments.table), read_table(arguments.again)
     if not fresh:
         raise TableError(f"{arguments.again}: no rows; python -m taic_jax.experiments.evidence --table makes them")
-    for row in fresh:
-        pair = [select([each], row["task"], row["method"]) for each in (row, counterpart(row, committed))]
-        lines += compare(*pair)
-    write_numbers(lines, arguments.out, FIELDS)
+    pairs = [(row, counterpart(row, committed)) for row in fresh]
+    lines = [line for pair in pairs for line in compare(*(select([x], x["task"], x["method"]) for x in pair))]
+    write_numbers(lines, arguments.out)
     print(f"{sum(line['within'] for line in lines)} of {len(lines)} within the interval")
 
 

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure as Picture
 from scipy import stats
 
 from taic_jax.analysis.statistics import iqm, probability_of_improvement
-from taic_jax.experiments.evidence.numbers import with_improvement, with_interval
+from taic_jax.experiments.evidence.numbers import BOUNDS, with_improvement, with_interval
 from taic_jax.experiments.evidence.plan import BASELINE, FLAT, METHODS, ROBOTS
 from taic_jax.experiments.evidence.table import EvidenceRows, TableError
 from taic_jax.experiments.figures import drawing
@@ -29,9 +29,7 @@ class Figure7(Figure):
         "task", "method", "seeds", "ticks", "pretraining", "iqm", "low", "high", "auc", "auc_low", "auc_high",
         "jump_start", "jump_starts_positive", "ticks_to_threshold", "reached", "improvement", "improvement_low",
         "improvement_high", "p_holm", "improvement_on_weak", "improvement_at_same_total", "mean",
-        "improvement_of_means", "improvement_of_means_low", "improvement_of_means_high",
-        "improvement_of_means_at_same_total", "improvement_of_means_at_same_total_low",
-        "improvement_of_means_at_same_total_high", "remarks",
+        *(f"improvement_of_means{name}{bound}" for name in ("", "_at_same_total") for bound in BOUNDS), "remarks",
     )  # fmt: skip
 
     tasks: tuple[str, ...] = ROBOTS

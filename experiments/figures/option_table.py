@@ -1,7 +1,6 @@
 """One table of every kind of options on every robot: returns, durations, and measures of the option space."""
 
 import dataclasses
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -55,7 +54,9 @@ class OptionTable:
             lines += [line(runs, methods.get(BASELINE)) for runs in methods.values()]
         if not lines:
             raise TableError(f"{self.table}: no run of a robot; python -m taic_jax.experiments.evidence makes them")
-        save_text(self.out, f"# Options, of every kind\n\n{as_markdown(lines)}\n{NOTE}")
+        headings = [*KINDS, "P", *COLUMNS]
+        table = "".join(f"| {' | '.join(cells)} |\n" for cells in [headings, ["---"] * len(headings), *lines])
+        save_text(self.out, f"# Options, of every kind\n\n{table}\n{NOTE}")
         print(self.out)
 
 
@@ -77,15 +78,8 @@ def cell(values: np.ndarray | None) -> str:
 
 def line(runs: EvidenceRows, flat: EvidenceRows | None) -> list[str]:
     """Return the cells of one method on one task."""
-    cells = [runs.task, *kind(runs.method), str(len(runs.seeds))]
     p = ""
-    if flat not in (None, runs):
+    if flat is not None and flat is not runs:
         p = f"{probability_of_improvement(runs.numbers['last'], flat.numbers['last'])[0]:.2f}"
-    return [*cells, p, *(cell(runs.numbers.get(name)) for name in COLUMNS.values())]
-
-
-def as_markdown(lines: Sequence[Sequence[str]]) -> str:
-    """Return the table with its headings."""
-    headings = [*KINDS, "P", *COLUMNS]
-    rows = [headings, ["---"] * len(headings), *lines]
-    return "".join(f"| {' | '.join(row)} |\n" for row in rows)
+    cells = (cell(runs.numbers.get(name)) for name in COLUMNS.values())
+    return [runs.task, *kind(runs.method), str(len(runs.seeds)), p, *cells]
