@@ -68,19 +68,19 @@ def hold(
 
 
 def walk(env: Env, executor: Executor, key: Key[Array, ""]) -> dict[str, Array]:
-    """Return the ways in m, [CODES, STARTS, 2], of codes that are `held`, then `kept`, or `changed` for others.
+    """Return the ways in m, [CODES, STARTS, 2], `before` codes change, and then under the `same` or a `changed` code.
 
     `over` [CODES, STARTS] tells whose ants lie on their backs after the change.
     """
-    key_codes, key_start, key_held, key_after = jax.random.split(key, 4)
+    key_codes, key_start, key_before, key_after = jax.random.split(key, 4)
     env = AutoReset(Unending(env))
     drawn = jax.random.normal(key_codes, (2, CODES, executor.option_size))
     codes, others = jnp.repeat(drawn, STARTS, axis=1)
-    after, held = hold(env, executor, start(env, executor, len(codes), key_start), codes, key_held)
-    _, kept = hold(env, executor, after, codes, key_after)
+    after, before = hold(env, executor, start(env, executor, len(codes), key_start), codes, key_before)
+    _, same = hold(env, executor, after, codes, key_after)
     last, changed = hold(env, executor, after, others, key_after)
     over = jax.vmap(upside_down)(last.env.physics.qpos[:, 3:7])
-    ways = {"held": held, "kept": kept, "changed": changed, "over": over}
+    ways = {"before": before, "same": same, "changed": changed, "over": over}
     return jax.tree.map(lambda x: x.reshape(CODES, STARTS, *x.shape[1:]), ways)
 
 
@@ -94,17 +94,17 @@ def measure(ways: dict[str, np.ndarray]) -> dict[str, float]:
     """Return the measures of one model's ways.
 
     Returns: `distance` in m; the share that go `ahead`, within 45 degrees of where the ant faced; the shares that turn
-    by more than 45 degrees under a code that is `changed` or `kept`; the `agreement` of one code's ways from several
-    starts, which is the length of the mean of their unit vectors; and the share that ends `upside_down`.
+    by more than 45 degrees under a changed or the same code; the `agreement` of one code's ways from several starts,
+    which is the length of the mean of their unit vectors; and the share that ends `upside_down`.
     """
-    held = ways["held"]
-    distance = np.linalg.norm(held, axis=-1, keepdims=True)
+    before = ways["before"]
+    distance = np.linalg.norm(before, axis=-1, keepdims=True)
     measures = {
         "distance": distance.mean(),
-        "ahead": (angle(held, np.array([1.0, 0.0])) < 45).mean(),
-        "turned_when_changed": (angle(ways["changed"], held) > 45).mean(),
-        "turned_when_kept": (angle(ways["kept"], held) > 45).mean(),
-        "agreement": np.linalg.norm((held / np.maximum(distance, 1e-9)).mean(axis=1), axis=-1).mean(),
+        "ahead": (angle(before, np.array([1.0, 0.0])) < 45).mean(),
+        "turned_when_changed": (angle(ways["changed"], before) > 45).mean(),
+        "turned_when_kept": (angle(ways["same"], before) > 45).mean(),
+        "agreement": np.linalg.norm((before / np.maximum(distance, 1e-9)).mean(axis=1), axis=-1).mean(),
         "upside_down": ways["over"].mean(),
     }
     return {name: float(value) for name, value in measures.items()}
