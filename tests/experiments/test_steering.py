@@ -12,7 +12,7 @@ from written_runs import write_options, write_run
 
 from taic_jax.envs import State
 from taic_jax.envs.base import PhysicsState
-from taic_jax.experiments import steering
+from taic_jax.experiments.evidence import steering
 
 
 class Sliding(Probe):
@@ -33,9 +33,9 @@ class Sliding(Probe):
 
 def test_codes_that_are_ways_are_measured_as_such():
     ways = jax.device_get(steering.walk(Sliding(), Repeat(50, option_size=2), jax.random.key(0)))
-    assert ways["held"].shape == (steering.CODES, steering.STARTS, 2)
-    np.testing.assert_allclose(ways["kept"], ways["held"], atol=1e-3)
-    assert (np.abs(ways["held"]).max(axis=-1) > 0.1).all() and np.abs(ways["held"]).max() <= 60 + 1e-3
+    assert ways["before"].shape == (steering.CODES, steering.STARTS, 2)
+    np.testing.assert_allclose(ways["same"], ways["before"], atol=1e-3)
+    assert (np.abs(ways["before"]).max(axis=-1) > 0.1).all() and np.abs(ways["before"]).max() <= 60 + 1e-3
     told = steering.measure(ways)
     assert told["turned_when_kept"] == 0 and told["upside_down"] == 1 and told["agreement"] == pytest.approx(1)
     # Three of four directions are further than 45 degrees from another, and as many from ahead.
@@ -44,9 +44,9 @@ def test_codes_that_are_ways_are_measured_as_such():
 
 def test_measures_of_ways_that_are_known():
     """Of two codes from two starts: the one goes 2 m ahead, the other 1 m to the left and 1 m to the right."""
-    held = np.array([[[2.0, 0.0], [2.0, 0.0]], [[0.0, 1.0], [0.0, -1.0]]])
-    kept, changed = np.array([[0.0, 1.0], [1.0, 0.9]]), np.array([[-1.0, 0.0], [0.0, -1.0]])
-    ways = {"held": held, "kept": np.stack([kept, kept]), "changed": np.stack([changed, changed])}
+    before = np.array([[[2.0, 0.0], [2.0, 0.0]], [[0.0, 1.0], [0.0, -1.0]]])
+    same, changed = np.array([[0.0, 1.0], [1.0, 0.9]]), np.array([[-1.0, 0.0], [0.0, -1.0]])
+    ways = {"before": before, "same": np.stack([same, same]), "changed": np.stack([changed, changed])}
     told = steering.measure(ways | {"over": np.array([[True, False], [False, False]])})
     assert told == pytest.approx(
         {
@@ -66,7 +66,7 @@ def test_options_of_real_ants_are_measured(tmp_path, monkeypatch):
     config = with_fields(CONFIG, env__name="ant")
     run, out = write_run(tmp_path / "ant" / "tiny", config), tmp_path / "steering.csv"
     write_options(run, config, experience=False)
-    steering.main([str(run), "--out", str(out)])
+    assert steering.main([str(run), "--out", str(out)]) == 0
     with out.open() as file:
         rows = {row["measure"]: row for row in csv.DictReader(file)}
     assert {(row["run"], row["seeds"], row["length"]) for row in rows.values()} == {("ant/tiny", "2", "2")}
@@ -88,14 +88,12 @@ def test_what_cannot_be_steered_is_refused(task, options, message, tmp_path, cap
     run = write_run(tmp_path / "run", config)
     if options:
         write_options(run, config, experience=False)
-    with pytest.raises(SystemExit) as stop:
-        steering.main([str(run), "--out", str(tmp_path / "steering.csv")])
-    assert stop.value.code == 2 and message in capsys.readouterr().err
+    assert steering.main([str(run), "--out", str(tmp_path / "steering.csv")]) == 2
+    assert message in capsys.readouterr().err
     assert not (tmp_path / "steering.csv").exists()
 
 
 def test_no_run_is_refused(tmp_path, capsys):
-    with pytest.raises(SystemExit) as stop:
-        steering.main(["--out", str(tmp_path / "steering.csv")])
-    assert stop.value.code == 2 and "expected the folder of at least one run, got none" in capsys.readouterr().err
+    assert steering.main(["--out", str(tmp_path / "steering.csv")]) == 2
+    assert "expected the folder of at least one run, got none" in capsys.readouterr().err
     assert not (tmp_path / "steering.csv").exists()

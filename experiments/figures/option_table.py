@@ -1,25 +1,16 @@
-"""One table of every kind of options on every robot: returns, durations, and measures of the option space.
-
-python -m taic_jax.experiments.option_table
-
-Reads the table of finished runs alone, and writes Markdown.
-"""
+"""One table of every kind of options on every robot: returns, durations, and measures of the option space."""
 
 import dataclasses
-import sys
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import tyro
 
 from taic_jax.analysis.statistics import probability_of_improvement
-from taic_jax.command_line import tell
-from taic_jax.experiments.cells import FLAT, METHODS, OTHERS, ROBOTS
-from taic_jax.experiments.drawing import RESULTS
-from taic_jax.experiments.figure7 import BASELINE, read_methods, with_interval
-from taic_jax.experiments.spaces import PREFIX
-from taic_jax.experiments.table import TABLE, EvidenceRows, TableError, read_table
+from taic_jax.experiments.evidence.measures import PREFIX
+from taic_jax.experiments.evidence.numbers import with_interval
+from taic_jax.experiments.evidence.plan import BASELINE, FLAT, METHODS, OTHERS, ROBOTS
+from taic_jax.experiments.evidence.table import RESULTS, TABLE, EvidenceRows, TableError, read_table
+from taic_jax.experiments.figures.frame import read_methods
 from taic_jax.runtime.files import save_text
 
 # Heading, and the number per seed that stands below it.
@@ -42,18 +33,31 @@ seed returns more than one of strong flat PPO at the same ticks of the task. Dis
 and the state change of options from the prior, executed from one state, and from many; R² is that of an MLP fitted to
 the codes of windows.
 
-Made by `python -m taic_jax.experiments.option_table`.
+Made by `python -m taic_jax.experiments.figures table`.
 """
 
 
 @dataclasses.dataclass(frozen=True)
-class Arguments:
+class OptionTable:
     """Write the table of all kinds of options."""
 
     table: Path = TABLE
     """The table of finished runs."""
     out: Path = RESULTS / "options.md"
     """The file, in Markdown."""
+
+    def make(self) -> None:
+        """Write the table."""
+        rows, lines = read_table(self.table), []
+        for task in ROBOTS:
+            methods = read_methods(rows, task, METHODS | OTHERS).methods
+            lines += [line(runs, methods.get(BASELINE)) for runs in methods.values()]
+        if not lines:
+            raise TableError(f"{self.table}: no run of a robot; python -m taic_jax.experiments.evidence makes them")
+        headings = [*KINDS, "P", *COLUMNS]
+        table = "".join(f"| {' | '.join(cells)} |\n" for cells in [headings, ["---"] * len(headings), *lines])
+        save_text(self.out, f"# Options, of every kind\n\n{table}\n{NOTE}")
+        print(self.out)
 
 
 def kind(method: str) -> list[str]:
@@ -74,41 +78,8 @@ def cell(values: np.ndarray | None) -> str:
 
 def line(runs: EvidenceRows, flat: EvidenceRows | None) -> list[str]:
     """Return the cells of one method on one task."""
-    cells = [runs.task, *kind(runs.method), str(len(runs.seeds))]
-    p = (
-        ""
-        if flat in (None, runs)
-        else f"{probability_of_improvement(runs.numbers['last'], flat.numbers['last'])[0]:.2f}"
-    )
-    return [*cells, p, *(cell(runs.numbers.get(name)) for name in COLUMNS.values())]
-
-
-def as_markdown(lines: Sequence[Sequence[str]]) -> str:
-    """Return the table with its headings."""
-    headings = [*KINDS, "P", *COLUMNS]
-    rows = [headings, ["---"] * len(headings), *lines]
-    return "".join(f"| {' | '.join(row)} |\n" for row in rows)
-
-
-def main(args: Sequence[str] | None = None) -> None:
-    """Write the table."""
-    arguments = tyro.cli(Arguments, args=args)
-    lines = []
-    try:
-        rows = read_table(arguments.table)
-        for task in ROBOTS:
-            found, _ = read_methods(rows, task, METHODS | OTHERS)
-            lines += [line(runs, found.get(BASELINE)) for runs in found.values()]
-        if not lines:
-            raise TableError(
-                f"{arguments.table}: no run of a robot; python -m taic_jax.experiments.evidence makes them"
-            )
-    except TableError as error:
-        print(f"option_table: {error}", file=sys.stderr)
-        raise SystemExit(2) from None
-    save_text(arguments.out, f"# Options, of every kind\n\n{as_markdown(lines)}\n{NOTE}")
-    print(arguments.out)
-
-
-if __name__ == "__main__":
-    sys.exit(tell(main))
+    p = ""
+    if flat is not None and flat is not runs:
+        p = f"{probability_of_improvement(runs.numbers['last'], flat.numbers['last'])[0]:.2f}"
+    cells = (cell(runs.numbers.get(name)) for name in COLUMNS.values())
+    return [runs.task, *kind(runs.method), str(len(runs.seeds)), p, *cells]

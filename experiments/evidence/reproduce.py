@@ -1,7 +1,7 @@
-"""Compare rows that were made anew with those of the table: does what the figures show come out again?
+"""Compare rows that were made anew with those of the table: can what the figures show be reproduced?
 
 python -m taic_jax.experiments.evidence --only walker2d/fixed-open-both --table again.jsonl --run-dir runs/again
-python -m taic_jax.experiments.again again.jsonl
+python -m taic_jax.experiments.evidence.reproduce again.jsonl
 
 The same seeds on another machine differ in the last bit, and after some steps in everything: a row comes out again
 where its interquartile mean is within the interval of the committed row.
@@ -19,11 +19,9 @@ from scipy import stats
 
 from taic_jax.analysis.statistics import exact_interval
 from taic_jax.command_line import tell
-from taic_jax.experiments.drawing import RESULTS
-from taic_jax.experiments.figure5c import recovered
-from taic_jax.experiments.figure7 import with_interval, write_numbers
-from taic_jax.experiments.spaces import PREFIX
-from taic_jax.experiments.table import TABLE, EvidenceRows, TableError, read_table, select
+from taic_jax.experiments.evidence.measures import PREFIX, has_recovered
+from taic_jax.experiments.evidence.numbers import with_interval, write_numbers
+from taic_jax.experiments.evidence.table import RESULTS, TABLE, EvidenceRows, TableError, read_table, select
 
 # What the figures show of a row, where it has it: heading, and the number per seed.
 MEASURES = {
@@ -35,9 +33,7 @@ MEASURES = {
     "effect of dimension 0": "effect/0",
     "effect of dimension 1": "effect/1",
 }
-FIELDS = (
-    "task", "method", "seeds", "measure", "value", "low", "high", "again", "again_low", "again_high", "within", "p",
-)  # fmt: skip
+OURS, THEIRS = ("again", "again_low", "again_high"), ("value", "low", "high")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,39 +69,38 @@ def compare(ours: EvidenceRows, theirs: EvidenceRows) -> list[dict[str, Any]]:
     for measure, name in MEASURES.items():
         if name in theirs.numbers:
             values, fresh = theirs.numbers[name], ours.numbers[name]
-            line = {"measure": measure} | with_interval(values, ("value", "low", "high"))
-            line |= with_interval(fresh, ("again", "again_low", "again_high"))
-            lines.append(line | {"p": float(stats.mannwhitneyu(values, fresh).pvalue)})
+            p = float(stats.mannwhitneyu(values, fresh).pvalue)
+            lines.append((measure, with_interval(values, THEIRS) | with_interval(fresh, OURS), p))
     if "success_after" in theirs.numbers:
-        lines.append({"measure": "recovered"} | share(theirs, ("value", "low", "high"))
-                     | share(ours, ("again", "again_low", "again_high")))  # fmt: skip
-    known = {"task": theirs.task, "method": theirs.method, "seeds": len(theirs.seeds)}
-    return [known | line | {"within": line["low"] <= line["again"] <= line["high"]} for line in lines]
+        lines.append(("recovered", share(theirs, THEIRS) | share(ours, OURS), ""))
+    name = {"task": theirs.task, "method": theirs.method, "seeds": len(theirs.seeds)}
+    return [
+        name | {"measure": measure} | line | {"within": line["low"] <= line["again"] <= line["high"], "p": p}
+        for measure, line, p in lines
+    ]
 
 
 def share(runs: EvidenceRows, names: Sequence[str]) -> dict[str, float]:
     """Return the share of seeds that recovered, and its exact 95 % interval."""
-    back = recovered(runs)
+    back = has_recovered(runs.numbers)
     return dict(zip(names, (float(np.mean(back)), *exact_interval(int(back.sum()), len(back))), strict=True))
 
 
-def main(args: Sequence[str] | None = None) -> None:
-    """Write the comparison, and tell how much of it came out again."""
-    arguments = tyro.cli(Arguments, args=args)
-    lines = []
-    try:
-        committed, fresh = read_table(arguments.table), read_table(arguments.again)
-        if not fresh:
-            raise TableError(f"{arguments.again}: no rows; python -m taic_jax.experiments.evidence --table makes them")
-        for row in fresh:
-            pair = [select([each], row["task"], row["method"]) for each in (row, counterpart(row, committed))]
-            lines += compare(*pair)
-    except TableError as error:
-        print(f"again: {error}", file=sys.stderr)
-        raise SystemExit(2) from None
-    write_numbers(lines, FIELDS, arguments.out)
+def write_comparison(arguments: Arguments) -> None:
+    """Write the comparison, and how much of it came out again."""
+    committed, fresh = read_table(arguments.table), read_table(arguments.again)
+    if not fresh:
+        raise TableError(f"{arguments.again}: no rows; python -m taic_jax.experiments.evidence --table makes them")
+    pairs = [(row, counterpart(row, committed)) for row in fresh]
+    lines = [line for pair in pairs for line in compare(*(select([x], x["task"], x["method"]) for x in pair))]
+    write_numbers(lines, arguments.out)
     print(f"{sum(line['within'] for line in lines)} of {len(lines)} within the interval")
 
 
+def main(args: Sequence[str] | None = None) -> int:
+    """Compare two tables, and return the exit code."""
+    return tell(lambda: write_comparison(tyro.cli(Arguments, args=args)))
+
+
 if __name__ == "__main__":
-    sys.exit(tell(main))
+    sys.exit(main())

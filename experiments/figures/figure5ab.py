@@ -1,41 +1,42 @@
 """Figures 5a and 5b: interpolation between two options of the room, and one dimension of an option at a time.
 
-python -m taic_jax.experiments.figure5ab
-
-Reads the table alone. The numbers are means over option models with 95 % bootstrap intervals of their interquartile
-mean: how smoothly interpolated codes pass from one path to the other, beside codes of other windows between the same
-ends; and by how much each dimension moves the end point.
+The numbers are means over option models with 95 % bootstrap intervals of their interquartile mean: how smoothly
+interpolated codes pass from one path to the other, beside codes of other windows between the same ends; and by how much
+each dimension moves the end point.
 """
 
-import dataclasses
-import sys
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
+import matplotlib.pyplot as plt
 import numpy as np
-import tyro
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure as Picture
 
-from taic_jax.command_line import tell
-from taic_jax.experiments.cells import PATHS, RECOVERY
-from taic_jax.experiments.drawing import BLUE, GREY, RED, RESULTS, mark, plt, save, styled
-from taic_jax.experiments.figure7 import with_interval, write_numbers
-from taic_jax.experiments.option_paths import SWEEP
-from taic_jax.experiments.table import TABLE, TableError, read_table, select
+from taic_jax.experiments.evidence.measures import SWEEP
+from taic_jax.experiments.evidence.numbers import with_interval
+from taic_jax.experiments.evidence.plan import PATHS, RECOVERY
+from taic_jax.experiments.evidence.table import select
+from taic_jax.experiments.figures import drawing
+from taic_jax.experiments.figures.frame import Figure, Rows
 
 MODELS = 10
-FIELDS = ("measure", "models", "iqm", "low", "high", "remarks")
 
 
-@dataclasses.dataclass(frozen=True)
-class Arguments:
-    """Draw figures 5a and 5b and write their numbers."""
+class Figure5ab(Figure):
+    """Draw figures 5a and 5b, and write their numbers."""
 
-    table: Path = TABLE
-    """The table of finished runs."""
-    out: Path = RESULTS / "figure5ab.png"
-    """The picture; its numbers are written beside it as CSV."""
+    number = "5ab"
+
+    def draw(self, rows: Rows) -> tuple[Picture, Rows]:
+        """Return the picture and its numbers."""
+        runs = select(rows, RECOVERY, PATHS, MODELS)
+        example = next(row["example"] for row in rows if (row["task"], row["method"]) == (RECOVERY, PATHS))
+        numbers = [
+            {"measure": name, "models": len(values), **with_interval(values), "remarks": "; ".join(runs.remarks)}
+            for name, values in runs.numbers.items()
+        ]
+        return picture(example, numbers, runs.remarks), numbers
 
 
 def draw_paths(axes: Axes, paths: np.ndarray, originals: np.ndarray, values: np.ndarray) -> None:
@@ -43,14 +44,13 @@ def draw_paths(axes: Axes, paths: np.ndarray, originals: np.ndarray, values: np.
     for path, value in zip(paths, (values - values.min()) / np.ptp(values), strict=True):
         axes.plot(*path.T, color=plt.colormaps["viridis"](0.9 * value), linewidth=1.6)
     for path in originals:
-        axes.plot(*path.T, "--", color=RED, linewidth=1.6)
+        axes.plot(*path.T, "--", color=drawing.RED, linewidth=1.6)
     axes.plot(0, 0, "o", color="black", markersize=3)
     axes.set_aspect("equal", adjustable="datalim")
     axes.set_xlabel("x in m")
 
 
-@styled
-def draw(example: dict[str, Any], rows: list[dict[str, Any]], remarks: Sequence[str], out: Path) -> None:
+def picture(example: dict[str, Any], rows: Rows, remarks: Sequence[str]) -> Picture:
     """Draw the interpolation, the effect of each dimension, and the numbers."""
     between, paths, swept = (np.array(example[name]) for name in ("between", "interpolated", "swept"))
     size = len(swept)
@@ -59,9 +59,9 @@ def draw(example: dict[str, Any], rows: list[dict[str, Any]], remarks: Sequence[
     left = figure.add_subplot(grid[:, 0])
     draw_paths(left, paths, between, np.arange(len(paths)))
     left.set_ylabel("y in m")
-    left.plot([], [], "--", color=RED, label="windows of the experience")
+    left.plot([], [], "--", color=drawing.RED, label="windows of the experience")
     left.legend(loc="upper left")
-    mark(left, "a) between two options", remarks)
+    drawing.mark(left, "a) between two options", remarks)
     for d in range(size):
         axes = figure.add_subplot(grid[d // ((size + 1) // 2), 2 + d % ((size + 1) // 2)])
         draw_paths(axes, swept[d], between[:1], SWEEP)
@@ -73,33 +73,10 @@ def draw(example: dict[str, Any], rows: list[dict[str, Any]], remarks: Sequence[
         axes = figure.add_subplot(grid[i, 1])
         values = np.array([[numbers[name][key] for key in ("iqm", "low", "high")] for name in names])
         errors = np.abs(values[:, 1:].T - values[:, 0])
-        colours = [BLUE, GREY] if i == 0 else BLUE
+        colours = [drawing.BLUE, drawing.GREY] if i == 0 else drawing.BLUE
         axes.bar(range(len(names)), values[:, 0], yerr=np.nan_to_num(errors), color=colours, capsize=3)
         axes.set_xticks(range(len(names)), ticks, rotation=30 if i == 0 else 0, ha="right" if i == 0 else "center")
         axes.set_ylabel(label)
         if i:
             axes.set_xlabel("dimension")
-    save(figure, out)
-
-
-def main(args: Sequence[str] | None = None) -> None:
-    """Draw the figure and write its numbers."""
-    arguments = tyro.cli(Arguments, args=args)
-    try:
-        table = read_table(arguments.table)
-        runs = select(table, RECOVERY, PATHS, MODELS)
-    except TableError as error:
-        print(f"figure5ab: {error}", file=sys.stderr)
-        raise SystemExit(2) from None
-    example = next(row["example"] for row in table if (row["task"], row["method"]) == (RECOVERY, PATHS))
-    rows = []
-    for name, values in runs.numbers.items():
-        rows.append(
-            {"measure": name, "models": len(values), **with_interval(values), "remarks": "; ".join(runs.remarks)}
-        )
-    draw(example, rows, runs.remarks, arguments.out)
-    write_numbers(rows, FIELDS, arguments.out.with_suffix(".csv"))
-
-
-if __name__ == "__main__":
-    sys.exit(tell(main))
+    return figure

@@ -1,7 +1,7 @@
 """What all figures share: colours, curves of many seeds, and marks for what is missing."""
 
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import matplotlib
@@ -16,13 +16,11 @@ from PIL import Image
 
 from taic_jax.analysis.statistics import iqm, stratified_interval
 
-# Okabe and Ito's palette, which readers who confuse colours can tell apart.
-GREY, BLACK, ORANGE, SKY, GREEN, BLUE, RED, PINK = (
-    "#8c8c8c", "#000000", "#e69f00", "#56b4e9", "#009e73", "#0072b2", "#d55e00", "#cc79a7",
+# Okabe and Ito's palette, which readers who confuse colours can tell apart, with an olive and a purple.
+COLOURS = BLACK, OLIVE, GREY, PINK, SKY, ORANGE, BLUE, GREEN, RED, PURPLE = (
+    "#000000", "#a89b00", "#8c8c8c", "#cc79a7", "#56b4e9", "#e69f00", "#0072b2", "#009e73", "#d55e00", "#6a1b9a",
 )  # fmt: skip
-OLIVE, PURPLE = "#a89b00", "#6a1b9a"
 WARNING = "#b00020"
-RESULTS = Path("experiments/results")
 LEGEND = "curves: while training, with its noise; dots: after training, mean actions or mean options, without noise"
 """Title of the legend where `draw_curves` and `draw_end` draw."""
 
@@ -59,14 +57,20 @@ def interactions(axes: Axes, label: str) -> None:
     axes.set_xlabel(label)
 
 
+def add_legend(figure: Figure, panels: Iterable[Axes], ncols: int) -> None:
+    """Explain below all panels the curves that stand in some of them."""
+    lines = {str(line.get_label()): line for axes in panels for line in axes.get_lines()}
+    lines = {label: line for label, line in lines.items() if label[0] != "_"}
+    figure.legend(lines.values(), lines.keys(), loc="outside lower center", ncols=ncols, title=LEGEND)
+
+
 def mark(axes: Axes, title: str, remarks: Sequence[str], width: int = 52) -> None:
     """Title a panel, and write above it what is missing or mixed in it."""
     axes.set_title(title, loc="left")
     lines = [line for remark in remarks for line in textwrap.wrap(remark, width, subsequent_indent="   ")]
     if lines:
-        axes.text(
-            0.0, 1.01, "\n".join(lines), transform=axes.transAxes, va="bottom", fontsize=7.5, color=WARNING,
-        )  # fmt: skip
+        text = "\n".join(lines)
+        axes.text(0.0, 1.01, text, transform=axes.transAxes, va="bottom", fontsize=7.5, color=WARNING)
         axes.set_title(title, loc="left", pad=6 + 9.5 * len(lines))
 
 

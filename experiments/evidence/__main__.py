@@ -1,4 +1,4 @@
-"""Do the runs that the figures need, and keep a row of each in the table: see README.md beside this file.
+"""Do the runs that the figures need, and keep a row of each in the table: see README.md of the experiments.
 
 python -m taic_jax.experiments.evidence --list
 python -m taic_jax.experiments.evidence --only nav2d
@@ -10,7 +10,7 @@ its last checkpoint.
 import dataclasses
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from pathlib import Path
 from typing import Any
 
@@ -19,19 +19,17 @@ import jax.numpy as jnp
 import tyro
 
 from taic_jax.command_line import tell
-from taic_jax.config import ConfigError, Shard
-from taic_jax.experiments.cells import PATHS, SPACES, Cell, all_cells
-from taic_jax.experiments.option_paths import paths_of
-from taic_jax.experiments.spaces import example_space, measure_spaces
-from taic_jax.experiments.table import TABLE, TableError, append_row, config_hash, difference, read_table, row_of
+from taic_jax.config import Shard
+from taic_jax.experiments.evidence.measures import example_space, measure_run_paths, measure_spaces
+from taic_jax.experiments.evidence.plan import PATHS, SPACES, Cell, Key, all_cells
+from taic_jax.experiments.evidence.table import TABLE, TableError, append_row, config_hash, read_table, row_of
 from taic_jax.pipeline import collect, make_envs, run_pipeline, take_over, train_baseline
-from taic_jax.runtime.checkpoint import ArtifactError
 from taic_jax.runtime.devices import Devices, make_devices, open_devices
 from taic_jax.runtime.driver import CLOCK, Clock, Run
-from taic_jax.runtime.files import SaveError, save_text
+from taic_jax.runtime.files import save_text
 from taic_jax.runtime.logging import RunLogger
 from taic_jax.runtime.program_cache import keep_programs
-from taic_jax.runtime.run_folder import RunFolderError, claimed, prepare_folder
+from taic_jax.runtime.run_folder import RunFolder, claimed, prepare_folder
 from taic_jax.summary import as_summary
 from taic_jax.types import as_rows
 
@@ -50,20 +48,15 @@ class Arguments:
     """Folder of the runs."""
 
 
-def missing(cell: Cell, known: set[tuple[str, str, int]]) -> bool:
-    """Return whether the table lacks a row of a run; one that gives none is asked for only by those that use it."""
-    return bool(cell.keys - known)
-
-
 def sources(cell: Cell, run_dir: Path) -> set[str]:
     """Return the names of the runs that a run takes experience, options or policies from."""
     options = cell.config.options
     return {str(Path(name).relative_to(run_dir)) for name in (*options.experience, options.source) if name}
 
 
-def plan(cells: Sequence[Cell], only: tuple[str, ...], known: set[tuple[str, str, int]], run_dir: Path) -> list[Cell]:
+def plan(cells: Sequence[Cell], only: tuple[str, ...], present: Set[Key], run_dir: Path) -> list[Cell]:
     """Return the runs to be done, and before them those that they take something from, however far back, and that are
-    not finished.
+    not finished; a run that gives no row is done only for others.
 
     Raises:
         TableError: no run has such a name.
@@ -71,47 +64,38 @@ def plan(cells: Sequence[Cell], only: tuple[str, ...], known: set[tuple[str, str
     unknown = [text for text in only if not any(cell.name.startswith(text) for cell in cells)]
     if unknown:
         raise TableError(f"--only: expected the start of a run's name, got {unknown[0]}; --list shows them")
-    wanted = [cell for cell in cells if missing(cell, known) and (not only or cell.name.startswith(only))]
+    wanted = [cell for cell in cells if cell.keys - present and (not only or cell.name.startswith(only))]
     names = {cell.name for cell in wanted}
     for cell in reversed(cells):  # those that others take something from stand before them
         if cell.name in names:
-            names |= {name for name in sources(cell, run_dir) if not finished(run_dir / name)}
+            names |= {name for name in sources(cell, run_dir) if not RunFolder(run_dir / name).finished}
     return [cell for cell in cells if cell.name in names]
-
-
-def finished(folder: Path) -> bool:
-    """Return whether a run's folder holds all that a row is made of."""
-    return (folder / "summary.json").is_file()
 
 
 def do(cell: Cell, run_dir: Path, shard: Shard = "none") -> None:
     """Do a run, or what is left of it, with its seeds split over devices where asked."""
     folder = run_dir / cell.name
-    begun = (folder / "config.yaml").is_file()
-    if finished(folder):
+    run = RunFolder(folder)
+    if run.finished:
         prepare_folder(cell.config, folder, resume=True)  # only checks that it is this run
     elif len(cell.stages) == 1 and not set(cell.stages.values()) & {"train", "options"}:
         (stage,) = cell.stages.values()
-        run_flat(cell, folder, stage, make_devices(shard, cell.config), begun)
+        run_flat(cell, folder, stage, make_devices(shard, cell.config), run.begun)
     else:
-        run_pipeline(cell.config, folder, resume=begun, shard=shard)
+        run_pipeline(cell.config, folder, resume=run.begun, shard=shard)
 
 
 def make_row(cell: Cell, run_dir: Path, method: str, stage: str) -> dict[str, Any]:
     """Return the row of one method of a finished run; of options on a robot with the measures of their spaces."""
+    folder = run_dir / cell.name
     if method == PATHS:
-        return paths_row(run_dir / cell.name, run_dir)
-    row = row_of(run_dir / cell.name, run_dir, method, stage)
+        row = row_of(folder, run_dir, PATHS, "train") | {"curves": {}, "grid": [], "ticks": 0}
+        return row | measure_run_paths(folder)
+    row = row_of(folder, run_dir, method, stage)
     if cell.figure in ("6", "7") and stage == "train":
-        row["numbers"] |= measure_spaces(run_dir / cell.name)
-        row |= {"example": example_space(run_dir / cell.name)} if method in SPACES else {}
+        row["numbers"] |= measure_spaces(folder)
+        row |= {"example": example_space(folder)} if method in SPACES else {}
     return row
-
-
-def paths_row(folder: Path, run_dir: Path) -> dict[str, Any]:
-    """Return the row of what the options of a finished run draw."""
-    row = row_of(folder, run_dir, PATHS, "train") | {"curves": {}, "grid": [], "ticks": 0}
-    return row | paths_of(folder)
 
 
 def run_flat(cell: Cell, folder: Path, stage: str, devices: Devices, resume: bool) -> None:
@@ -130,54 +114,53 @@ def run_flat(cell: Cell, folder: Path, stage: str, devices: Devices, resume: boo
     save_text(folder / "summary.json", json.dumps(summary, indent=2) + "\n")
 
 
-def main(args: Sequence[str] | None = None) -> None:
-    """List or do the runs."""
-    arguments = tyro.cli(Arguments, args=args)
-    cells = all_cells(arguments.run_dir)
-    try:
-        rows = {(row["task"], row["method"], row["seed"]): row for row in read_table(arguments.table)}
-        known = set(rows)
-        planned = plan(cells, arguments.only, known, arguments.run_dir)
-        if arguments.list:
-            show(cells, rows, arguments)
-            print(f"{len(planned)} runs to do")
-            return
-        if not planned:
-            print("nothing to do: the table has every row that these runs give")
-            return
-        keep_programs()
-        shard = open_devices("auto", max((cell.config.seeds for cell in planned), default=0))
-        for cell in planned:
-            print(f"{cell.name}: {cell.config.seeds} seeds from {cell.config.seed}", flush=True)
-            do(cell, arguments.run_dir, shard)
-            for method, stage in cell.stages.items():
-                if (cell.config.env.name, method, cell.config.seed) not in known:
-                    append_row(arguments.table, make_row(cell, arguments.run_dir, method, stage))
-    except (ArtifactError, ConfigError, RunFolderError, SaveError, TableError) as error:
-        print(f"evidence: {error}", file=sys.stderr)
-        raise SystemExit(2) from None
-
-
-def show(cells: Sequence[Cell], rows: dict[tuple[str, str, int], dict[str, Any]], arguments: Arguments) -> None:
-    """Print every run: its figure, its interactions, and what is known of it."""
+def show(cells: Sequence[Cell], rows: dict[Key, dict[str, Any]], arguments: Arguments) -> None:
+    """Print every run: its figure, its interactions, and how far it is."""
     for cell in cells:
         if arguments.only and not cell.name.startswith(arguments.only):
             continue
         folder = arguments.run_dir / cell.name
-        if finished(folder):
+        if RunFolder(folder).finished:
             state = "finished, to be taken in" if cell.stages else "finished"
         elif folder.exists():
             state = "begun"
         else:
             state = "missing" if cell.stages else "made when another run needs it"
         if cell.stages and cell.keys <= rows.keys():
-            found = [rows[key] for key in cell.keys]
-            state = f"in the table, took {max(row['seconds'] for row in found) / 60:.0f} minutes"
-            if {row["config"] for row in found} != {config_hash(difference(cell.config, arguments.run_dir))}:
+            own = [rows[key] for key in cell.keys]
+            state = f"in the table, took {max(row['seconds'] for row in own) / 60:.0f} minutes"
+            if {row["config"] for row in own} != {config_hash(cell.config, arguments.run_dir)}:
                 state += ", is of another config: cut its rows to do it again"
         ticks = cell.config.train.ticks if "collect" not in cell.stages.values() else cell.config.collect.ticks
         print(f"figure {cell.figure}  {cell.name:36} {cell.config.seeds:3} seeds x {ticks:9,} ticks  {state}")
 
 
+def execute(arguments: Arguments) -> None:
+    """List the runs, or do those that are missing."""
+    cells = all_cells(arguments.run_dir)
+    rows = {(row["task"], row["method"], row["seed"]): row for row in read_table(arguments.table)}
+    planned = plan(cells, arguments.only, rows.keys(), arguments.run_dir)
+    if arguments.list:
+        show(cells, rows, arguments)
+        print(f"{len(planned)} runs to do")
+        return
+    if not planned:
+        print("nothing to do: the table has every row that these runs give")
+        return
+    keep_programs()
+    shard = open_devices("auto", max(cell.config.seeds for cell in planned))
+    for cell in planned:
+        print(f"{cell.name}: {cell.config.seeds} seeds from {cell.config.seed}", flush=True)
+        do(cell, arguments.run_dir, shard)
+        for method, stage in cell.stages.items():
+            if (cell.config.env.name, method, cell.config.seed) not in rows:
+                append_row(arguments.table, make_row(cell, arguments.run_dir, method, stage))
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """List or do the runs, and return the exit code."""
+    return tell(lambda: execute(tyro.cli(Arguments, args=args)))
+
+
 if __name__ == "__main__":
-    sys.exit(tell(main))
+    sys.exit(main())

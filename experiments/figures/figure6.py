@@ -1,29 +1,25 @@
 """Figure 6: do options that lead to like states have like codes? HalfCheetah, without and with the constraints.
 
-python -m taic_jax.experiments.figure6
-
-Reads the table alone; needs scikit-learn (extra `viz`). As the paper drew it: a point is an option executed from one
-state; its place is t-SNE of the state that the option led to, its colour t-SNE of the option. t-SNE differs with its
-perplexity, hence three of them; and beside it stand measures of the option spaces themselves, over all option models.
+Needs scikit-learn (extra `viz`). As the paper drew it: a point is an option executed from one state; its place is t-SNE
+of the state that the option led to, its colour t-SNE of the option. t-SNE differs with its perplexity, hence three of
+them; and beside it stand measures of the option spaces themselves, over all option models.
 """
 
 import dataclasses
-import sys
-from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
+import matplotlib.pyplot as plt
 import numpy as np
-import tyro
 from jaxtyping import Float
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure as Picture
 
-from taic_jax.command_line import tell
-from taic_jax.experiments.cells import METHODS, OTHERS, SPACES
-from taic_jax.experiments.drawing import BLUE, GREY, RESULTS, mark, plt, save, styled
-from taic_jax.experiments.figure7 import with_interval, write_numbers
-from taic_jax.experiments.spaces import PREFIX
-from taic_jax.experiments.table import TABLE, EvidenceRows, TableError, read_table, select
+from taic_jax.experiments.evidence.measures import PREFIX
+from taic_jax.experiments.evidence.numbers import with_interval
+from taic_jax.experiments.evidence.plan import METHODS, OTHERS, SPACES
+from taic_jax.experiments.evidence.table import EvidenceRows, TableError, select
+from taic_jax.experiments.figures import drawing
+from taic_jax.experiments.figures.frame import Figure, Rows
 
 PERPLEXITIES = (10, 30, 90)
 MODELS = 10
@@ -34,19 +30,28 @@ MEASURES = {
 }
 CORNERS = np.array([[[0.90, 0.10, 0.20], [0.95, 0.75, 0.10]], [[0.20, 0.25, 0.80], [0.10, 0.75, 0.45]]])
 """Colours of the four corners of a square."""
-FIELDS = ("task", "method", "models", "measure", "iqm", "low", "high", "remarks")
 
 
 @dataclasses.dataclass(frozen=True)
-class Arguments:
-    """Draw figure 6 and write its numbers."""
+class Figure6(Figure):
+    """Draw figure 6, and write its numbers."""
 
-    table: Path = TABLE
-    """The table of finished runs."""
-    out: Path = RESULTS / "figure6.png"
-    """The picture; its numbers are written beside it as CSV."""
+    number = "6"
     task: str = "half_cheetah"
     """The robot."""
+
+    def draw(self, rows: Rows) -> tuple[Picture, Rows]:
+        """Return the picture and its numbers."""
+        rows = [row for row in rows if row["task"] == self.task]
+        present = {row["method"] for row in rows}
+        methods = {name: select(rows, self.task, name, MODELS) for name in METHODS | OTHERS if name in present}
+        lines = [line for runs in methods.values() for line in numbers(runs)]
+        if not lines:
+            expected = f"{self.table}: no row of figure {self.number}"
+            raise TableError(f"{expected}; python -m taic_jax.experiments.evidence --only {self.task} makes them")
+        examples = {row["method"]: row["example"] for row in rows if row["method"] in SPACES and row.get("example")}
+        remarks = {name: methods[name].remarks if name in methods else ("missing",) for name in SPACES}
+        return picture(examples, lines, remarks), lines
 
 
 def as_colours(points: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 3"]:
@@ -69,7 +74,7 @@ def embed(points: Any, perplexity: int) -> Float[np.ndarray, "N 2"]:
     return TSNE(perplexity=perplexity, init="pca", random_state=0).fit_transform(np.asarray(points, np.float32))
 
 
-def numbers(runs: EvidenceRows) -> list[dict[str, Any]]:
+def numbers(runs: EvidenceRows) -> Rows:
     """Return a row for each measure of one kind of options: its mean over option models, with a 95 % interval."""
     rows = []
     for name, values in runs.numbers.items():
@@ -79,25 +84,21 @@ def numbers(runs: EvidenceRows) -> list[dict[str, Any]]:
     return rows
 
 
-def draw_measure(axes: Axes, name: str, rows: Sequence[dict[str, Any]]) -> None:
+def draw_measure(axes: Axes, name: str, rows: Rows) -> None:
     """Draw one measure of every kind of options, those with the constraints in blue."""
     shown = [row for row in rows if row["measure"] == name][::-1]
     for y, row in enumerate(shown):
-        colour = GREY if row["method"].endswith("none") else BLUE
+        colour = drawing.GREY if row["method"].endswith("none") else drawing.BLUE
         axes.plot([row["low"], row["high"]], [y, y], color=colour, linewidth=2)
         axes.plot(row["iqm"], y, "o", color=colour)
     axes.set_yticks(range(len(shown)), [row["method"].replace("-", ", ") for row in shown], fontsize=7.5)
     axes.set_xlabel(MEASURES[name])
 
 
-@styled
-def draw(
-    examples: dict[str, dict[str, Any]], rows: Sequence[dict[str, Any]], remarks: dict[str, Sequence[str]], out: Path
-) -> None:
+def picture(examples: dict[str, dict[str, Any]], rows: Rows, remarks: dict[str, tuple[str, ...]]) -> Picture:
     """Draw a column of t-SNE for each of the paper's panels, a row for each perplexity, and the measures beside."""
-    figure, panels = plt.subplots(
-        len(PERPLEXITIES), len(SPACES) + 1, figsize=(13.5, 9.6), width_ratios=[1.0] * len(SPACES) + [1.2]
-    )
+    widths = [1.0] * len(SPACES) + [1.2]
+    figure, panels = plt.subplots(len(PERPLEXITIES), len(widths), figsize=(13.5, 9.6), width_ratios=widths)
     for line, perplexity in zip(panels, PERPLEXITIES, strict=True):
         for axes, (method, label) in zip(line[:-1], SPACES.items(), strict=True):
             axes.set_xticks([])
@@ -106,32 +107,9 @@ def draw(
                 colours = as_colours(embed(examples[method]["options"], perplexity))
                 axes.scatter(*embed(examples[method]["ends"], perplexity).T, c=colours, s=12)
             if perplexity == PERPLEXITIES[0]:
-                mark(axes, label, remarks[method], width=36)
+                drawing.mark(axes, label, remarks[method], width=36)
         line[0].set_ylabel(f"perplexity {perplexity}")
     for axes, name in zip(panels[:, -1], MEASURES, strict=True):
         draw_measure(axes, name, rows)
     figure.suptitle("place: t-SNE of the state an option led to; colour: t-SNE of the option", x=0.01, ha="left")
-    save(figure, out)
-
-
-def main(args: Sequence[str] | None = None) -> None:
-    """Draw the figure and write its numbers."""
-    arguments = tyro.cli(Arguments, args=args)
-    try:
-        table = read_table(arguments.table)
-        held = {row["method"]: row.get("example") for row in table if row["task"] == arguments.task}
-        found = {method: select(table, arguments.task, method, MODELS) for method in METHODS | OTHERS if method in held}
-        rows = [row for runs in found.values() for row in numbers(runs)]
-        if not rows:
-            name = f"{arguments.table}: no row of figure 6"
-            raise TableError(f"{name}; python -m taic_jax.experiments.evidence --only {arguments.task} makes them")
-        remarks = {name: found[name].remarks if name in found else ["missing"] for name in SPACES}
-        draw({name: held[name] for name in SPACES if held.get(name)}, rows, remarks, arguments.out)
-    except TableError as error:
-        print(f"figure6: {error}", file=sys.stderr)
-        raise SystemExit(2) from None
-    write_numbers(rows, FIELDS, arguments.out.with_suffix(".csv"))
-
-
-if __name__ == "__main__":
-    sys.exit(tell(main))
+    return figure

@@ -1,6 +1,6 @@
 """Whether codes steer: where an ant goes while one is held, and whether it goes elsewhere under another.
 
-python -m taic_jax.experiments.steering RUN... --out FILE
+python -m taic_jax.experiments.evidence.steering RUN... --out FILE
 
 Takes the options of finished runs, draws codes from the prior, and writes a row per run and measure.
 """
@@ -23,23 +23,21 @@ from taic_jax.analysis.option_space import always
 from taic_jax.artifacts.models import load_options
 from taic_jax.command_line import tell
 from taic_jax.config import ConfigError
-from taic_jax.config_io import load_config
 from taic_jax.envs.ant_tasks import upside_down
 from taic_jax.envs.base import Env, State
 from taic_jax.envs.wrappers import AutoReset, Wrapper
-from taic_jax.experiments.drawing import RESULTS
-from taic_jax.experiments.figure7 import with_interval, write_numbers
+from taic_jax.experiments.evidence.numbers import with_interval, write_numbers
+from taic_jax.experiments.evidence.table import RESULTS
 from taic_jax.options.execution import Executor, make_executor
 from taic_jax.pipeline import make_envs
 from taic_jax.rl.rollout import RolloutCarry, rollout, start
-from taic_jax.runtime.checkpoint import ArtifactError
+from taic_jax.runtime.run_folder import RunFolder
 from taic_jax.types import as_arrays
 
 CODES, STARTS = 64, 8
 """Codes of each model, and the starts that each is held from."""
 SECONDS = 3.0
 """For which a code is held."""
-FIELDS = ("run", "seeds", "length", "measure", "iqm", "low", "high", "per_seed")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,19 +68,19 @@ def hold(
 
 
 def walk(env: Env, executor: Executor, key: Key[Array, ""]) -> dict[str, Array]:
-    """Return the ways in m, [CODES, STARTS, 2], of codes that are `held`, then `kept`, or `changed` for others.
+    """Return the ways in m, [CODES, STARTS, 2], `before` codes change, and then under the `same` or a `changed` code.
 
     `over` [CODES, STARTS] tells whose ants lie on their backs after the change.
     """
-    key_codes, key_start, key_held, key_after = jax.random.split(key, 4)
+    key_codes, key_start, key_before, key_after = jax.random.split(key, 4)
     env = AutoReset(Unending(env))
     drawn = jax.random.normal(key_codes, (2, CODES, executor.option_size))
     codes, others = jnp.repeat(drawn, STARTS, axis=1)
-    after, held = hold(env, executor, start(env, executor, len(codes), key_start), codes, key_held)
-    _, kept = hold(env, executor, after, codes, key_after)
+    after, before = hold(env, executor, start(env, executor, len(codes), key_start), codes, key_before)
+    _, same = hold(env, executor, after, codes, key_after)
     last, changed = hold(env, executor, after, others, key_after)
     over = jax.vmap(upside_down)(last.env.physics.qpos[:, 3:7])
-    ways = {"held": held, "kept": kept, "changed": changed, "over": over}
+    ways = {"before": before, "same": same, "changed": changed, "over": over}
     return jax.tree.map(lambda x: x.reshape(CODES, STARTS, *x.shape[1:]), ways)
 
 
@@ -96,17 +94,17 @@ def measure(ways: dict[str, np.ndarray]) -> dict[str, float]:
     """Return the measures of one model's ways.
 
     Returns: `distance` in m; the share that go `ahead`, within 45 degrees of where the ant faced; the shares that turn
-    by more than 45 degrees under a code that is `changed` or `kept`; the `agreement` of one code's ways from several
-    starts, which is the length of the mean of their unit vectors; and the share that ends `upside_down`.
+    by more than 45 degrees under a changed or the same code; the `agreement` of one code's ways from several starts,
+    which is the length of the mean of their unit vectors; and the share that ends `upside_down`.
     """
-    held = ways["held"]
-    distance = np.linalg.norm(held, axis=-1, keepdims=True)
+    before = ways["before"]
+    distance = np.linalg.norm(before, axis=-1, keepdims=True)
     measures = {
         "distance": distance.mean(),
-        "ahead": (angle(held, np.array([1.0, 0.0])) < 45).mean(),
-        "turned_when_changed": (angle(ways["changed"], held) > 45).mean(),
-        "turned_when_kept": (angle(ways["kept"], held) > 45).mean(),
-        "agreement": np.linalg.norm((held / np.maximum(distance, 1e-9)).mean(axis=1), axis=-1).mean(),
+        "ahead": (angle(before, np.array([1.0, 0.0])) < 45).mean(),
+        "turned_when_changed": (angle(ways["changed"], before) > 45).mean(),
+        "turned_when_kept": (angle(ways["same"], before) > 45).mean(),
+        "agreement": np.linalg.norm((before / np.maximum(distance, 1e-9)).mean(axis=1), axis=-1).mean(),
         "upside_down": ways["over"].mean(),
     }
     return {name: float(value) for name, value in measures.items()}
@@ -119,7 +117,7 @@ def steering_of(folder: Path) -> tuple[int, dict[str, np.ndarray]]:
       ConfigError: its robot cannot go in every direction.
       ArtifactError: there are no options.
     """
-    config = load_config(str(folder / "config.yaml"))
+    config = RunFolder(folder).config()
     _, env = make_envs(config)
     robot: Any = getattr(env, "model", None)
     if robot is None or robot.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE:
@@ -135,24 +133,23 @@ def steering_of(folder: Path) -> tuple[int, dict[str, np.ndarray]]:
     return config.options.length, {name: np.array([row[name] for row in measured]) for name in measured[0]}
 
 
-def main(args: Sequence[str] | None = None) -> None:
-    """Measure, write the rows and print them."""
-    arguments = tyro.cli(Arguments, args=args)
+def write_measures(arguments: Arguments) -> None:
+    """Measure the runs, and write the rows."""
+    if not arguments.runs:
+        raise ConfigError("expected the folder of at least one run, got none")
     rows = []
-    try:
-        if not arguments.runs:
-            raise ConfigError("expected the folder of at least one run, got none")
-        for folder in arguments.runs:
-            length, measures = steering_of(folder)
-            run = "/".join(folder.parts[-2:])
-            for name, values in measures.items():
-                row = {"run": run, "seeds": len(values), "length": length, "measure": name, "per_seed": values}
-                rows.append(row | with_interval(values))
-    except (ConfigError, ArtifactError) as error:
-        print(f"steering: {error}", file=sys.stderr)
-        raise SystemExit(2) from None
-    write_numbers(rows, FIELDS, arguments.out)
+    for folder in arguments.runs:
+        length, measures = steering_of(folder)
+        for name, values in measures.items():
+            row = {"run": "/".join(folder.parts[-2:]), "seeds": len(values), "length": length, "measure": name}
+            rows.append(row | with_interval(values) | {"per_seed": values})
+    write_numbers(rows, arguments.out)
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Measure runs, and return the exit code."""
+    return tell(lambda: write_measures(tyro.cli(Arguments, args=args)))
 
 
 if __name__ == "__main__":
-    sys.exit(tell(main))
+    sys.exit(main())

@@ -14,15 +14,15 @@ from typing import Any
 import numpy as np
 
 from taic_jax.config import Config, walk
-from taic_jax.config_io import load_config
-from taic_jax.experiments.recovery import recovery_of
-from taic_jax.runtime.files import save_text
-from taic_jax.runtime.logging import read_metrics
+from taic_jax.experiments.evidence.measures import recovery_of
+from taic_jax.experiments.evidence.numbers import DIGITS
+from taic_jax.runtime.files import json_safe, save_text
+from taic_jax.runtime.run_folder import Row, RunFolder
 
-TABLE = Path("experiments/results/evidence.jsonl")
+RESULTS = Path("experiments/results")
+TABLE = RESULTS / "evidence.jsonl"
 GRID = 50
 """Points of a curve, equally far apart; the last is the end of training."""
-DIGITS = 5
 EARLIER_DEFAULTS = {"collect.capacity": 1_000_000}
 """Of fields whose default has changed since the first row."""
 OWN = ("seed", "seeds")
@@ -52,8 +52,8 @@ def difference(config: Config, run_dir: Path) -> dict[str, Any]:
     """Return the fields that are not the default, without the seeds; what is taken from others is named in `run_dir`.
 
     A field that a later version adds is at its default, and so leaves the hash of an earlier run as it was; one whose
-    default was changed is compared with the earlier one. The runs
-    of other seeds take theirs from the runs of those seeds: their names differ in the seed alone, which is left out.
+    default was changed is compared with the earlier one. The runs of other seeds take theirs from the runs of those
+    seeds: their names differ in the seed alone, which is left out.
     """
     default = dict(walk(Config())) | EARLIER_DEFAULTS
     fields = {name: value for name, value in walk(config) if name not in OWN and value != default[name]}
@@ -68,8 +68,9 @@ def difference(config: Config, run_dir: Path) -> dict[str, Any]:
     return fields
 
 
-def config_hash(fields: dict[str, Any]) -> str:
-    """Return twelve digits that tell one config from another."""
+def config_hash(config: Config, run_dir: Path) -> str:
+    """Return twelve digits that tell one config from another, whatever its seeds."""
+    fields = difference(config, run_dir)
     return hashlib.sha256(json.dumps(fields, sort_keys=True, default=list).encode()).hexdigest()[:12]
 
 
@@ -96,7 +97,7 @@ def append_row(path: Path, row: dict[str, Any]) -> None:
     """Add a row; a process that is killed leaves the table with it or without it."""
     path.parent.mkdir(parents=True, exist_ok=True)
     lines = path.read_text() if path.exists() else ""
-    save_text(path, f"{lines}{json.dumps(_rounded(row), allow_nan=False, separators=(',', ':'))}\n")
+    save_text(path, f"{lines}{json.dumps(json_safe(row, DIGITS), allow_nan=False, separators=(',', ':'))}\n")
 
 
 def row_of(folder: Path, run_dir: Path, method: str, stage: str) -> dict[str, Any]:
@@ -108,14 +109,13 @@ def row_of(folder: Path, run_dir: Path, method: str, stage: str) -> dict[str, An
         method: its name in the table.
         stage: the stage that trained it.
     """
-    config = load_config(str(folder / "config.yaml"))
-    fields = difference(config, run_dir)
-    summary = json.loads((folder / "summary.json").read_text())
-    told = summary["methods"]["taic" if stage == "train" else stage]
+    run = RunFolder(folder)
+    config, summary = run.config(), run.summary()
+    evaluated = summary["methods"]["taic" if stage == "train" else stage]
     ticks = {"collect": config.collect.ticks, "total": config.collect.ticks + config.train.ticks}
     ticks = ticks.get(stage, config.train.ticks)
     grid = np.arange(1, GRID + 1) * (ticks // GRID)
-    logged = [row for row in read_metrics(folder / "metrics.jsonl") if row["stage"] == stage]
+    logged = run.metrics(stage)
     curves, numbers = curves_of(logged, stage, grid), {}
     if config.env.change_after:
         shares, numbers = recovery_of(logged, stage)
@@ -127,8 +127,8 @@ def row_of(folder: Path, run_dir: Path, method: str, stage: str) -> dict[str, An
         "seeds": config.seeds,
         "ticks": ticks,
         "pretraining": pretraining_of(config) if stage in ("train", "transfer") else 0,
-        "config": config_hash(fields),
-        "fields": fields,
+        "config": config_hash(config, run_dir),
+        "fields": difference(config, run_dir),
         "versions": summary["versions"],
         "commit": summary["commit"],
         "seconds": round(summary["seconds"]["run"]),
@@ -136,11 +136,11 @@ def row_of(folder: Path, run_dir: Path, method: str, stage: str) -> dict[str, An
         "grid": grid.tolist(),
         "curves": curves,
         "numbers": {
-            "first": told["return"]["first_per_seed"],
-            "last": told["return"]["per_seed"],
-            "mean_option": told["return_mean_option"]["per_seed"],
-            "duration": told["duration"]["per_seed"],
-            **{name: value["per_seed"] for name, value in told["metrics"].items()},
+            "first": evaluated["return"]["first_per_seed"],
+            "last": evaluated["return"]["per_seed"],
+            "mean_option": evaluated["return_mean_option"]["per_seed"],
+            "duration": evaluated["duration"]["per_seed"],
+            **{name: value["per_seed"] for name, value in evaluated["metrics"].items()},
             **numbers,
         },
     }
@@ -149,10 +149,10 @@ def row_of(folder: Path, run_dir: Path, method: str, stage: str) -> dict[str, An
 def pretraining_of(config: Config) -> int:
     """Return the interactions that were spent on what a run takes from others, or on its own experience."""
     source = config.options.source or next(iter(config.options.experience), "")
-    return load_config(str(Path(source) / "config.yaml")).collect.ticks if source else config.collect.ticks
+    return (RunFolder(Path(source)).config() if source else config).collect.ticks
 
 
-def curves_of(rows: Sequence[dict[str, Any]], stage: str, grid: np.ndarray) -> dict[str, list]:
+def curves_of(rows: Sequence[Row], stage: str, grid: np.ndarray) -> dict[str, list]:
     """Return what figures draw of the training [K, G]: the return, and the share of ticks at the goal.
 
     The environments of a run begin their episodes together, and most are at the goal late in them: an iteration is a
@@ -166,7 +166,7 @@ def curves_of(rows: Sequence[dict[str, Any]], stage: str, grid: np.ndarray) -> d
     }
 
 
-def mean_on_grid(rows: Sequence[dict[str, Any]], values: np.ndarray, grid: np.ndarray) -> np.ndarray:
+def mean_on_grid(rows: Sequence[Row], values: np.ndarray, grid: np.ndarray) -> np.ndarray:
     """Return values [K, G]: at each point of the grid the mean of those [K, I] of the log's rows in the last two
     steps of the grid, or the latest where there is none.
     """
@@ -178,7 +178,7 @@ def mean_on_grid(rows: Sequence[dict[str, Any]], values: np.ndarray, grid: np.nd
     return means
 
 
-def on_grid(rows: Sequence[dict[str, Any]], values: np.ndarray, grid: np.ndarray) -> np.ndarray:
+def on_grid(rows: Sequence[Row], values: np.ndarray, grid: np.ndarray) -> np.ndarray:
     """Return values [K, G]: at each point of the grid the latest of those [K, I] of the log's rows."""
     latest = np.searchsorted([row["ticks"] for row in rows], grid, side="right") - 1
     return np.where(latest >= 0, values[:, np.maximum(latest, 0)], np.nan)
@@ -191,37 +191,26 @@ def select(rows: Sequence[dict[str, Any]], task: str, method: str, minimum: int 
         TableError: nothing, rows of different configs, or one seed twice: what may not be averaged.
     """
     name = f"{task}/{method}"
-    found = [row for row in rows if (row["task"], row["method"]) == (task, method)]
-    if not found:
+    matches = [row for row in rows if (row["task"], row["method"]) == (task, method)]
+    if not matches:
         raise TableError(f"{name}: no row; python -m taic_jax.experiments.evidence --only {name} makes it")
-    hashes = {row["config"] for row in found}
+    hashes = {row["config"] for row in matches}
     if len(hashes) > 1:
         raise TableError(f"{name}: rows of {len(hashes)} configs under one name: {', '.join(sorted(hashes))}")
-    seeds = [row["seed"] + k for row in found for k in range(row["seeds"])]
+    seeds = [row["seed"] + k for row in matches for k in range(row["seeds"])]
     if len(set(seeds)) < len(seeds):
         raise TableError(f"{name}: seed {max(seeds, key=seeds.count)} stands in several rows")
     remarks = []
     if len(seeds) < minimum:
         remarks.append(f"{len(seeds)} of {minimum} seeds")
-    differing = {k for row in found for k, v in row["versions"].items() if v != found[0]["versions"][k]}
+    differing = {k for row in matches for k, v in row["versions"].items() if v != matches[0]["versions"][k]}
     if differing - {"taic_jax"}:
         remarks.append(f"mixed versions of {', '.join(sorted(differing))}")
-    if stopped := sum(len(row["stopped"]) for row in found):
+    if stopped := sum(len(row["stopped"]) for row in matches):
         remarks.append(f"{stopped} diverged")
     return EvidenceRows(
-        task, method, tuple(seeds), found[0]["ticks"], found[0]["pretraining"], np.array(found[0]["grid"]),
-        {k: np.array([c for row in found for c in row["curves"][k]], float) for k in found[0]["curves"]},
-        {k: np.array([x for row in found for x in row["numbers"][k]], float) for k in found[0]["numbers"]},
+        task, method, tuple(seeds), matches[0]["ticks"], matches[0]["pretraining"], np.array(matches[0]["grid"]),
+        {k: np.array([c for row in matches for c in row["curves"][k]], float) for k in matches[0]["curves"]},
+        {k: np.array([x for row in matches for x in row["numbers"][k]], float) for k in matches[0]["numbers"]},
         tuple(remarks),
     )  # fmt: skip
-
-
-def _rounded(value: Any) -> Any:
-    """Round every float to a few digits, as a row is kept for good; what is not finite becomes None."""
-    if isinstance(value, dict):
-        return {name: _rounded(item) for name, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_rounded(item) for item in value]
-    if isinstance(value, float):
-        return float(f"{value:.{DIGITS}g}") if np.isfinite(value) else None
-    return value

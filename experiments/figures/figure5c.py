@@ -1,55 +1,51 @@
 """Figure 5c: recovery from a sudden change of the room, and the numbers of claim C4.
 
-python -m taic_jax.experiments.figure5c
-
-Reads the table alone. A seed has recovered where at least 90 % of the last 100 training episodes within 200 000 ticks
-after the change reach the goal; see `experiments.recovery`.
+A seed has recovered where at least 90 % of the last 100 training episodes within 200 000 ticks after the change reach
+the goal; see `evidence.measures.recovery_of`.
 """
 
-import dataclasses
-import sys
-from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
+import matplotlib.pyplot as plt
 import numpy as np
-import tyro
+from matplotlib.figure import Figure as Picture
 from scipy import stats
 
 from taic_jax.analysis.statistics import exact_interval
-from taic_jax.command_line import tell
-from taic_jax.experiments.cells import RECOVERING, RECOVERY
-from taic_jax.experiments.drawing import BLACK, RED, RESULTS, mark, plt, save, styled
-from taic_jax.experiments.figure7 import write_numbers
-from taic_jax.experiments.recovery import AFTER, RECOVERED
-from taic_jax.experiments.table import TABLE, EvidenceRows, TableError, read_table, select
+from taic_jax.experiments.evidence.measures import AFTER, has_learnt, has_recovered
+from taic_jax.experiments.evidence.plan import RECOVERING, RECOVERY
+from taic_jax.experiments.evidence.table import EvidenceRows, select
+from taic_jax.experiments.figures import drawing
+from taic_jax.experiments.figures.frame import Figure, Rows
 
 SEEDS = 50
 BEFORE = 80_000
 """Ticks before the change that are drawn."""
-COLOURS = {"options": RED, "flat": BLACK}
-FIELDS = ("method", "seeds", "changed", "learnt_before", "recovered", "low", "high", "recovered_of_learnt", "fisher_p",
-          "remarks")  # fmt: skip
+COLOURS = {"options": drawing.RED, "flat": drawing.BLACK}
 
 
-@dataclasses.dataclass(frozen=True)
-class Arguments:
-    """Draw figure 5c and write its numbers."""
+class Figure5c(Figure):
+    """Draw figure 5c, and write its numbers."""
 
-    table: Path = TABLE
-    """The table of finished runs."""
-    out: Path = RESULTS / "figure5c.png"
-    """The picture; its numbers are written beside it as CSV."""
+    number = "5c"
+    fields = (
+        "method", "seeds", "changed", "learnt_before", "recovered", "low", "high", "recovered_of_learnt", "fisher_p",
+        "remarks",
+    )  # fmt: skip
 
-
-def recovered(runs: EvidenceRows) -> np.ndarray:
-    """Return which seeds recovered [K]; one whose room never changed, or not for long enough, has not."""
-    return np.nan_to_num(runs.numbers["success_after"]) >= RECOVERED
+    def draw(self, rows: Rows) -> tuple[Picture, Rows]:
+        """Return the picture and its numbers."""
+        methods = {method: select(rows, RECOVERY, method, SEEDS) for method in RECOVERING}
+        lines = [numbers(runs) for runs in methods.values()]
+        counts = [(line["recovered"], line["seeds"] - line["recovered"]) for line in lines]
+        for line in lines:
+            line["fisher_p"] = float(stats.fisher_exact(counts).pvalue)
+        return picture(methods, lines), lines
 
 
 def numbers(runs: EvidenceRows) -> dict[str, Any]:
     """Return what the table of the figure says of one method."""
-    back, learnt = recovered(runs), np.nan_to_num(runs.numbers["success_before"]) >= RECOVERED
+    back, learnt = has_recovered(runs.numbers), has_learnt(runs.numbers)
     count, total = int(back.sum()), len(back)
     low, high = exact_interval(count, total)
     short = int((runs.numbers["ticks_after"] < AFTER).sum())
@@ -65,18 +61,17 @@ def around_the_change(runs: EvidenceRows, grid: np.ndarray) -> np.ndarray:
     """Return the share of successes [K, G] at ticks counted from each seed's own change; NaN where it never came."""
     rows = []
     for curve, at in zip(runs.curves["success"], runs.numbers["changed_at"], strict=True):
-        known = np.isfinite(curve)
-        if np.isfinite(at) and known.any():
-            rows.append(np.interp(grid, runs.grid[known] - at, curve[known], left=np.nan, right=np.nan))
+        finite = np.isfinite(curve)
+        if np.isfinite(at) and finite.any():
+            rows.append(np.interp(grid, runs.grid[finite] - at, curve[finite], left=np.nan, right=np.nan))
     return np.array(rows)
 
 
-@styled
-def draw(found: dict[str, EvidenceRows], rows: list[dict[str, Any]], out: Path) -> None:
+def picture(methods: dict[str, EvidenceRows], rows: Rows) -> Picture:
     """Draw the share of successes around the change, and how many seeds recovered."""
     figure, (left, right) = plt.subplots(1, 2, figsize=(9.5, 3.8), width_ratios=(3, 1))
     grid = np.linspace(-BEFORE, AFTER, 71)
-    for method, runs in found.items():
+    for method, runs in methods.items():
         values = around_the_change(runs, grid)
         label, colour = RECOVERING[method][0], COLOURS[method]
         left.plot(grid, values.T, color=colour, linewidth=0.4, alpha=0.18)
@@ -96,31 +91,7 @@ def draw(found: dict[str, EvidenceRows], rows: list[dict[str, Any]], out: Path) 
     right.set_xticks(range(len(rows)), names)
     right.set_ylabel("share of seeds recovered")
     right.set_ylim(0, 1)
-    mark(
-        left,
-        "a trap appears after 1000 episodes",
-        [f"{row['method']}: {row['remarks']}" for row in rows if row["remarks"]],
-    )
+    remarks = [f"{row['method']}: {row['remarks']}" for row in rows if row["remarks"]]
+    drawing.mark(left, "a trap appears after 1000 episodes", remarks)
     right.set_title(f"Fisher's exact p = {rows[0]['fisher_p']:.1g}", loc="left")
-    save(figure, out)
-
-
-def main(args: Sequence[str] | None = None) -> None:
-    """Draw the figure and write its numbers."""
-    arguments = tyro.cli(Arguments, args=args)
-    try:
-        table = read_table(arguments.table)
-        found = {method: select(table, RECOVERY, method, SEEDS) for method in RECOVERING}
-    except TableError as error:
-        print(f"figure5c: {error}", file=sys.stderr)
-        raise SystemExit(2) from None
-    rows = [numbers(runs) for runs in found.values()]
-    counts = [(row["recovered"], row["seeds"] - row["recovered"]) for row in rows]
-    for row in rows:
-        row["fisher_p"] = float(stats.fisher_exact(counts).pvalue)
-    draw(found, rows, arguments.out)
-    write_numbers(rows, FIELDS, arguments.out.with_suffix(".csv"))
-
-
-if __name__ == "__main__":
-    sys.exit(tell(main))
+    return figure

@@ -1,0 +1,228 @@
+"""What is measured of a finished run: its option spaces, the paths its options draw, and its recovery from a change.
+
+Measures are one number per seed; examples are those of the first seed's option model, and are drawn.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from taic_jax.analysis import option_space
+from taic_jax.artifacts.experience import EXPERIENCE, read_experience
+from taic_jax.artifacts.models import load_options
+from taic_jax.config import COLLECT, OptionsConfig
+from taic_jax.envs.navigation import MAX_SPEED, Navigation
+from taic_jax.options.dataset import Experience, gather, make_dataset
+from taic_jax.options.execution import make_executor
+from taic_jax.options.model import OptionModel
+from taic_jax.pipeline import make_envs
+from taic_jax.runtime.run_folder import Row, RunFolder
+from taic_jax.types import as_arrays
+
+SPACE_MEASURES = (
+    "kl", "active_dimensions", "prior/one/distance_correlation", "prior/many/distance_correlation",
+    "prior/one/trustworthiness", "window/distance_correlation", "window/mlp_r2/change", "window/mlp_r2/start",
+    "window/mlp_r2/end", "window/mutual_information/change", "window/mutual_information/permuted",
+)  # fmt: skip
+PREFIX = "space/"
+COUNT = 500
+"""Options of each kind that are measured."""
+SHOWN = 300
+"""Options of the example."""
+STEPS = 11
+"""Codes from one window's to another's, both included."""
+SWEEP = np.linspace(-2.0, 2.0, 9)
+"""What is added to one dimension of a code, in standard deviations of the prior."""
+PAIRS = 100
+"""Pairs of windows, and codes whose dimensions are changed, of each option model."""
+EPISODES = 100
+"""Fewest episodes that a share of successes is taken of."""
+AFTER = 200_000
+"""Ticks after the change in which a method may recover: 1000 episodes of the longest kind."""
+RECOVERED = 0.9
+"""Share of these last episodes that reach the goal where a seed has recovered."""
+
+
+def each_model(folder: Path) -> Iterator[tuple[OptionModel, Experience, Array]]:
+    """Yield the option model of each seed of a run, the experience that it was learnt from, and a key.
+
+    One at a time: the experience of all would not fit into memory.
+    """
+    config = RunFolder(folder).config()
+    source = Path(config.options.source or folder)
+    (name,) = config.options.experience or (COLLECT,)
+    models = load_options(folder, make_envs(config)[1], config.options, config.seeds)
+    for seed in range(config.seeds):
+        experience = read_experience((source if name == COLLECT else Path(name)) / EXPERIENCE, seed)
+        model = jax.tree.map(lambda x, k=seed: x[k], models)
+        yield model, jax.tree.map(jnp.asarray, experience), jax.random.key(config.seed + seed)
+
+
+def measure_spaces(folder: Path) -> dict[str, list[float]]:
+    """Return the measures of every seed's option space, under `space/NAME`."""
+    config = RunFolder(folder).config()
+    source = make_envs(config)[1]
+    measured = [
+        option_space.measure(source, config.options, model, experience, key, COUNT)
+        for model, experience, key in each_model(folder)
+    ]
+    return {f"{PREFIX}{name}": [row[name] for row in measured] for name in SPACE_MEASURES}
+
+
+def example_space(folder: Path) -> dict[str, Any]:
+    """Return options [N, D] drawn from the prior, and the states [N, P] that each led to from one state.
+
+    A state is measured in standard deviations of the experience.
+    """
+    config = RunFolder(folder).config()
+    env, source = make_envs(config)
+    model = jax.tree.map(lambda x: x[0], load_options(folder, env, config.options, config.seeds))
+    executor = make_executor(as_arrays(config.options), model)
+    key_options, key_run = jax.random.split(jax.random.key(config.seed))
+    options = jax.random.normal(key_options, (SHOWN, config.options.size))
+    effects = jax.jit(option_space.execute, static_argnums=0)(source, executor, options, key_run)
+    drawn = {"options": options, "ends": model.state_scale(effects.end)}
+    # More digits than a picture shows would be more than half of the table.
+    return {name: np.asarray(points, np.float64).round(2).tolist() for name, points in drawn.items()}
+
+
+def as_path(actions: Float[Array, "*batch L 2"]) -> Float[Array, "*batch L+1 2"]:
+    """Return the positions in m, from the origin, that velocities lead through where there are no walls."""
+    steps = MAX_SPEED * Navigation.dt * jnp.clip(actions, -1.0, 1.0)
+    return jnp.cumsum(jnp.concatenate([jnp.zeros_like(steps[..., :1, :]), steps], axis=-2), axis=-2)
+
+
+def decode(config: OptionsConfig, model: OptionModel, codes: Float[Array, "N D"]) -> Float[Array, "N L+1 2"]:
+    """Return the paths of codes decoded in open loop."""
+    states = jnp.zeros((config.length, model.state_size))
+    return as_path(jax.vmap(lambda code: model.decode(code, states)[0])(codes))
+
+
+def straightness(paths: Float[np.ndarray, "N I L 2"]) -> np.ndarray:
+    """Return how smoothly N rows of I paths pass from the first to the last, each in (0, 1].
+
+    It is the distance of the first and last path over the length of the way through all of them, a path being one
+    point of all its positions: 1 where each step leads straight on.
+    """
+    points = paths.reshape(*paths.shape[:2], -1)
+    way = np.linalg.norm(np.diff(points, axis=1), axis=-1).sum(axis=1)
+    return np.linalg.norm(points[:, -1] - points[:, 0], axis=-1) / np.maximum(way, 1e-9)
+
+
+@jax.jit
+def _draw_windows(
+    config: OptionsConfig, model: OptionModel, experience: Experience, key: Array
+) -> tuple[Float[Array, "N D"], Float[Array, "N L 2"]]:
+    """Draw pairs of windows from the selection; return the means of their codes, and their actions."""
+    dataset = make_dataset(experience, config)
+    which = jax.random.randint(key, (2 * PAIRS,), 0, dataset.count)
+    windows = gather(dataset, which, jnp.full(2 * PAIRS, config.length), config.length)
+    means, _ = jax.vmap(model.encode)(windows.actions)
+    return means[:, -1], windows.actions
+
+
+def measure_paths(config: OptionsConfig, model: OptionModel, experience: Experience, key: Array) -> dict[str, Any]:
+    """Measure one option model, and return its first pair and code as an example.
+
+    Returns: `smoothness` of interpolated codes; `shuffled`, that of as many codes between the same ends that belong to
+    other windows; `effect` [D], by how much a dimension moves the end point over the sweep, in m (root mean square),
+    the strongest first; and the `example`s' paths.
+    """
+    config = as_arrays(config)
+    key_windows, key_shuffle = jax.random.split(key)
+    codes, actions = _draw_windows(config, model, experience, key_windows)
+    first, last = codes[:PAIRS], codes[PAIRS:]
+    share = jnp.linspace(0.0, 1.0, STEPS)[None, :, None]
+    between = first[:, None] * (1 - share) + last[:, None] * share
+    others = codes[jax.random.randint(key_shuffle, (PAIRS, STEPS), 0, 2 * PAIRS)]
+    ends = jnp.arange(STEPS)[None, :, None]
+    others = jnp.where((ends == 0) | (ends == STEPS - 1), between, others)
+    size = codes.shape[1]
+    swept = first[:, None, None] + jnp.asarray(SWEEP, jnp.float32)[:, None] * jnp.eye(size)[:, None]
+    run = jax.jit(partial(decode, config, model))
+    paths = [np.asarray(run(x.reshape(-1, size))).reshape(*x.shape[:-1], -1, 2) for x in (between, others, swept)]
+    spread = paths[2][..., -1, :].std(axis=2)  # [N, D, 2], over the sweep
+    effect = np.sqrt((spread**2).sum(axis=-1).mean(axis=0))
+    order = np.argsort(-effect)
+    drawn = np.asarray(as_path(actions))
+    example = {
+        "interpolated": paths[0][0],
+        "between": drawn[[0, PAIRS]],
+        "swept": paths[2][0][order],
+        "original": drawn[0],
+    }
+    return {
+        "smoothness": float(straightness(paths[0]).mean()),
+        "shuffled": float(straightness(paths[1]).mean()),
+        "effect": effect[order].tolist(),
+        "example": {name: value.tolist() for name, value in example.items()},
+    }
+
+
+def measure_run_paths(folder: Path) -> dict[str, Any]:
+    """Return the `numbers` of what every seed's options of the room draw (section 4.1, figure 5), and the `example`."""
+    options = RunFolder(folder).config().options
+    measured = [measure_paths(options, *each) for each in each_model(folder)]
+    numbers = {name: [row[name] for row in measured] for name in ("smoothness", "shuffled")}
+    numbers |= {f"effect/{d}": [row["effect"][d] for row in measured] for d in range(options.size)}
+    return {"numbers": numbers, "example": measured[0]["example"]}
+
+
+def recovery_of(rows: Sequence[Row], stage: str) -> tuple[np.ndarray, dict[str, list]]:
+    """Return how a run fares where its task changes (section 4.1): successes per iteration, and numbers per seed.
+
+    The former are the share of episodes [K, I] that reached the goal. Numbers, NaN where the task never changed:
+    `changed_at`, the tick at which it did; `success_before` and `success_after`, the share of successes among the last
+    100 episodes before it, and among the last 100 that ended in the `AFTER` ticks behind it; `ticks_after`, the ticks
+    that a seed had behind it.
+
+    Args:
+        rows: of the stage, one per iteration.
+        stage: its name.
+    """
+    unit = rows[0]["ticks"]
+    changed, success, episodes = (
+        np.array([row[f"{stage}/{name}"] for row in rows], float).T
+        for name in ("mean/changed", "mean/success", "episodes")
+    )
+    reached = success * unit  # an episode ends at its success
+    shares = np.divide(reached, episodes, out=np.full_like(reached, np.nan), where=episodes > 0)
+    numbers: dict[str, list] = {"changed_at": [], "success_before": [], "success_after": [], "ticks_after": []}
+    for k in range(len(changed)):
+        behind = np.cumsum(changed[k] * unit)
+        numbers["ticks_after"].append(float(behind[-1]))
+        if not behind[-1]:
+            numbers["changed_at"].append(float("nan"))
+            numbers["success_before"].append(_last_share(reached[k], episodes[k]))
+            numbers["success_after"].append(float("nan"))
+            continue
+        before, within = changed[k] == 0, (changed[k] == 1) & (behind <= AFTER)
+        numbers["changed_at"].append(len(behind) * unit - float(behind[-1]))
+        numbers["success_before"].append(_last_share(reached[k, before], episodes[k, before]))
+        numbers["success_after"].append(_last_share(reached[k, within], episodes[k, within]))
+    return shares, numbers
+
+
+def has_recovered(numbers: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Return which seeds recovered [K]; one whose room never changed, or not for long enough, has not."""
+    return np.nan_to_num(numbers["success_after"]) >= RECOVERED
+
+
+def has_learnt(numbers: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Return which seeds reached the goal as reliably before the change [K]."""
+    return np.nan_to_num(numbers["success_before"]) >= RECOVERED
+
+
+def _last_share(reached: np.ndarray, episodes: np.ndarray) -> float:
+    """Return the share of successes of the fewest last iterations that hold `EPISODES` episodes, or NaN."""
+    counts = np.cumsum(episodes[::-1])
+    if not len(counts) or counts[-1] < EPISODES:
+        return float("nan")
+    last = np.argmax(counts >= EPISODES) + 1
+    return float(reached[-last:].sum() / counts[last - 1])

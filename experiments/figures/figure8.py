@@ -1,0 +1,119 @@
+"""Figure 8: options of Ant, as they are or fine-tuned, on its harder tasks, and the numbers of claim C3.
+
+A line of numbers is of one measure of one method. Success is to be within 5 m of the goal at the last tick of an
+episode (HIRO's definition); a seed's success is its share of evaluation episodes under its mean options.
+`training/success` is a share of ticks. An improvement is the probability that a seed does better than one of a
+baseline, or of options in open loop.
+"""
+
+import dataclasses
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.figure import Figure as Picture
+from scipy import stats
+
+from taic_jax.experiments.evidence.numbers import BOUNDS, with_improvement, with_interval
+from taic_jax.experiments.evidence.plan import TRANSFERRED, TRANSFERS
+from taic_jax.experiments.evidence.table import EvidenceRows
+from taic_jax.experiments.figures import drawing
+from taic_jax.experiments.figures.drawing import BLACK, BLUE, ORANGE, PURPLE, RED
+from taic_jax.experiments.figures.frame import Figure, Panel, Rows, numbers_of, read_panels
+
+SEEDS = 10
+COLOURS = {"open": ORANGE, "closed": RED, "tuned": PURPLE, "flat": BLACK, "transfer": BLUE}
+BASELINES = ("flat", "transfer")
+MEASURES = ("first", "last", "mean_option", "final/success", "final/closest_approach", "final/upside_down")
+LATE = 5
+"""Points of a curve, the last ones, whose mean is a measure of training."""
+CURVES = {"return": "training/return", "mean/success": "training/success"}
+LOWER = ("final/closest_approach", "final/upside_down")
+"""Measures of which less is better."""
+COMPARED = (*BASELINES, "open")
+
+
+@dataclasses.dataclass(frozen=True)
+class Figure8(Figure):
+    """Draw figure 8, and write its numbers."""
+
+    number = "8"
+    fields = (
+        "task", "method", "measure", "seeds", "ticks", "iqm", "low", "high", "mean",
+        *(f"improvement_on_{name}{bound}" for name in COMPARED for bound in BOUNDS),
+        "p_holm", "seeds_at_goal", "per_seed", "remarks",
+    )  # fmt: skip
+
+    tasks: tuple[str, ...] = TRANSFERS
+    """Panels."""
+
+    def draw(self, rows: Rows) -> tuple[Picture, Rows]:
+        """Return the picture and its numbers."""
+        methods = {name: (label, SEEDS) for name, (label, _) in TRANSFERRED.items()}
+        panels = read_panels(self, rows, self.tasks, methods)
+        return picture(panels), numbers_of(panels, numbers)
+
+
+def measured(runs: EvidenceRows) -> dict[str, np.ndarray]:
+    """Return the measures [K] of one method: those of evaluation, and the end of each curve of training."""
+    ends = {ours: runs.curves[name][:, -LATE:] for name, ours in CURVES.items() if name in runs.curves}
+    late = {name: np.nanmean(end, axis=1) for name, end in ends.items()}
+    return {name: runs.numbers[name] for name in MEASURES if name in runs.numbers} | late
+
+
+def at_goal(runs: EvidenceRows, measure: str) -> dict[str, str]:
+    """Return how many seeds are at the goal: in half of the evaluation, or at any time in training."""
+    if measure == "final/success":
+        there = runs.numbers[measure] >= 0.5
+    elif measure == "training/success":
+        there = (np.nan_to_num(runs.curves["mean/success"]) > 0).any(axis=1)
+    else:
+        return {}
+    return {"seeds_at_goal": f"{there.sum()}/{there.size}"}
+
+
+def numbers(runs: EvidenceRows, methods: dict[str, EvidenceRows]) -> Rows:
+    """Return what the table of the figure says of one method, a row per measure; p is of the worse comparison."""
+    rows, others = [], {name: measured(methods[name]) for name in COMPARED if name in methods}
+    for measure, values in measured(runs).items():
+        row: dict[str, Any] = {"task": runs.task, "method": runs.method, "measure": measure, "seeds": len(values)}
+        row |= {"ticks": runs.ticks, **with_interval(values), "mean": float(np.mean(values)), **at_goal(runs, measure)}
+        row |= {"per_seed": values, "remarks": "; ".join(runs.remarks)}
+        sign = -1 if measure in LOWER else 1
+        for name, other in others.items():
+            if name != runs.method:
+                row |= with_improvement(f"improvement_on_{name}", sign * values, sign * other[measure])
+        baselines = [others[name][measure] for name in BASELINES if name in others]
+        if measure == "last" and runs.method not in BASELINES and baselines:
+            row["p"] = max(stats.mannwhitneyu(values, x, alternative="greater").pvalue for x in baselines)
+        rows.append(row)
+    return rows
+
+
+def picture(panels: dict[str, Panel]) -> Picture:
+    """Draw a column per task: the return, and where there is a goal the share of ticks spent at it."""
+    goals = any("mean/success" in runs.curves for panel in panels.values() for runs in panel.methods.values())
+    names = ("return", "mean/success")[: 1 + goals]
+    size = 4.1 * len(panels) + 0.4, 3.0 * len(names) + 1.0
+    figure, grid = plt.subplots(len(names), len(panels), figsize=size, squeeze=False)
+    for column, (task, (methods, remarks)) in enumerate(panels.items()):
+        for axes, name in zip(grid[:, column], names, strict=True):
+            curves = {method: runs for method, runs in methods.items() if name in runs.curves}
+            for method, runs in curves.items():
+                style = COLOURS[method], TRANSFERRED[method][0]
+                drawing.draw_curves(axes, runs.grid, runs.curves[name], *style, dashed=method in BASELINES)
+                if name == "return":
+                    drawing.draw_end(axes, runs.grid[-1], runs.numbers["mean_option"], COLOURS[method])
+            if curves:
+                axes.set_xlim(left=0)
+                drawing.interactions(axes, "interactions with the task")
+            elif methods:
+                axes.set_axis_off()
+            else:
+                drawing.empty(axes)
+        drawing.mark(grid[0, column], task, remarks)
+    grid[0, 0].set_ylabel("return of an episode")
+    if goals:
+        grid[1, 1 % len(panels)].set_ylabel("share of ticks within 5 m of the goal")
+    drawing.add_legend(figure, grid[0], ncols=min(3, 2 * len(panels) - 1))
+    return figure
