@@ -14,8 +14,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import tyro
 
 from taic_jax.command_line import tell
@@ -27,14 +25,12 @@ from taic_jax.experiments.table import TABLE, TableError, append_row, config_has
 from taic_jax.pipeline import collect, run_pipeline, take_over, train_baseline
 from taic_jax.runtime.checkpoint import ArtifactError
 from taic_jax.runtime.devices import Devices, make_devices, open_devices
-from taic_jax.runtime.driver import CLOCK, Clock, Run
+from taic_jax.runtime.driver import Run
 from taic_jax.runtime.files import SaveError, save_text
-from taic_jax.runtime.logging import RunLogger
 from taic_jax.runtime.program_cache import keep_programs
-from taic_jax.runtime.run_folder import RunFolderError, claimed, prepare_folder
+from taic_jax.runtime.run_folder import RunFolder, RunFolderError
 from taic_jax.summary import as_summary
 from taic_jax.tasks import make_envs
-from taic_jax.types import as_rows
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,7 +86,7 @@ def do(cell: Cell, run_dir: Path, shard: Shard = "none") -> None:
     folder = run_dir / cell.name
     begun = (folder / "config.yaml").is_file()
     if finished(folder):
-        prepare_folder(cell.config, folder, resume=True)  # only checks that it is this run
+        RunFolder(folder).prepare(cell.config, resume=True)  # only checks that it is this run
     elif len(cell.stages) == 1 and not set(cell.stages.values()) & {"train", "options"}:
         (stage,) = cell.stages.values()
         run_flat(cell, folder, stage, make_devices(shard, cell.config), begun)
@@ -120,12 +116,7 @@ def run_flat(cell: Cell, folder: Path, stage: str, devices: Devices, resume: boo
     config = cell.config
     env, source = make_envs(config)
     _, policy = take_over(config, env, source)
-    prepare_folder(config, folder, resume=resume)
-    keys = jnp.stack([jax.random.key(config.seed + k) for k in range(config.seeds)])
-    with claimed(folder), RunLogger(folder) as logger:
-        clock = Clock.load(folder / CLOCK)
-        run = Run(as_rows([config], config.seeds), keys, folder, logger, clock, devices=devices)
-        logger.truncate("evaluate", -1)
+    with Run.open(config, folder, resume=resume, devices=devices) as run:
         trained = collect(run, source) if stage == "collect" else train_baseline(run, env, stage, policy)
     summary = as_summary(run, {stage: {"first": trained.first, "last": trained.last}})
     save_text(folder / "summary.json", json.dumps(summary, indent=2) + "\n")

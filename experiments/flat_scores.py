@@ -11,8 +11,6 @@ import dataclasses
 import sys
 from pathlib import Path
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import tyro
 
@@ -20,12 +18,10 @@ from taic_jax.analysis.statistics import bootstrap_interval, iqm
 from taic_jax.command_line import tell
 from taic_jax.config import CollectConfig, Config, EnvConfig, EvaluateConfig, PPOConfig, TrainConfig
 from taic_jax.pipeline import train_baseline
-from taic_jax.runtime.driver import CLOCK, Clock, Run
-from taic_jax.runtime.logging import RunLogger
-from taic_jax.runtime.run_folder import prepare_folder
+from taic_jax.runtime.driver import Run
+from taic_jax.runtime.run_folder import RunFolder
 from taic_jax.summary import commit
 from taic_jax.tasks import make_envs
-from taic_jax.types import as_rows
 
 # Mean return at one million interactions: CleanRL's benchmark (version 4; the ant's is the PPO of the TD3 paper,
 # version 1), and Tianshou's (version 3, the best evaluation of each run).
@@ -83,10 +79,7 @@ def score(arguments: Arguments, task: str) -> dict[str, str]:
         seeds=arguments.seeds,
     )
     folder = arguments.run_dir / task
-    prepare_folder(config, folder, resume=(folder / "config.yaml").is_file())
-    keys = jnp.stack([jax.random.key(config.seed + k) for k in range(config.seeds)])
-    with RunLogger(folder) as logger:
-        run = Run(as_rows([config], config.seeds), keys, folder, logger, Clock.load(folder / CLOCK))
+    with Run.open(config, folder, resume=RunFolder(folder).begun) as run:
         last = train_baseline(run, make_envs(config)[0], "flat").last
     returns = np.asarray(last["return"]["return"], float)
     low, high = bootstrap_interval(returns)

@@ -26,7 +26,7 @@ import tyro
 from taic_jax.command_line import tell
 from taic_jax.config import CollectConfig, Config, EnvConfig, EvaluateConfig, OptionsConfig, PPOConfig, TrainConfig
 from taic_jax.config_io import to_yaml
-from taic_jax.runtime.logging import read_metrics
+from taic_jax.runtime.run_folder import RunFolder
 
 POINTS = ("--axes", "train.ppo.learning_rate=3e-4,1e-3", "--chunk", "1")
 """Of the sweep: a chunk, that is a whole run, for each."""
@@ -90,7 +90,7 @@ def outcome(folder: Path) -> dict[str, Any]:
         chunks = {f"{path.name}/{name}": x for path in folder.glob("chunk-*") for name, x in outcome(path).items()}
         return chunks | {name: (folder / name).read_bytes() for name in ("table.csv", "best.yaml", "plan.json")}
     summary = json.loads((folder / "summary.json").read_text())
-    rows = [{k: v for k, v in row.items() if k != "time"} for row in read_metrics(folder / "metrics.jsonl")]
+    rows = [{k: v for k, v in row.items() if k != "time"} for row in RunFolder(folder).metrics()]
     rows.sort(key=lambda row: row["stage"])  # an evaluation is told again after a resume, later than it was
     result: dict[str, Any] = {"methods": summary["methods"], "ticks": summary["ticks"], "rows": rows}
     return result | dict(_arrays(folder))
@@ -118,8 +118,8 @@ def stage_of(folder: Path, kind: str) -> str:
     """Return the stage that a run was in when it was killed, or that it was a sweep."""
     if kind == "sweep":
         return "sweep"
-    path = folder / "metrics.jsonl"
-    rows = read_metrics(path) if path.exists() else []
+    run = RunFolder(folder)
+    rows = run.metrics() if run.metrics_path.exists() else []
     return "end" if (folder / "summary.json").exists() else rows[-1]["stage"] if rows else "start"
 
 

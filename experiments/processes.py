@@ -22,8 +22,8 @@ from taic_jax.experiments.turns import seconds
 from taic_jax.options.execution import Executor, IdentityExecutor
 from taic_jax.rl import ppo
 from taic_jax.runtime.devices import Devices, open_devices
-from taic_jax.runtime.logging import read_metrics
 from taic_jax.runtime.program_cache import keep_programs
+from taic_jax.runtime.run_folder import RunFolder
 from taic_jax.types import as_arrays, as_rows
 
 PATIENCE = 600.0
@@ -48,12 +48,12 @@ def _next_iteration(task: str, folder: Path, run_dir: Path, *options: str) -> fl
     environment = {key: value for key, value in os.environ.items() if not key.startswith("JAX_COMPILATION_CACHE")}
     environment |= {"XDG_CACHE_HOME": str(folder / "cache")}
     command = [sys.executable, "-m", "taic_jax.run", task, "--run-dir", str(run_dir), *options]
-    rows = run_dir / "metrics.jsonl"
-    before = len(read_metrics(rows)) if rows.is_file() else 0
+    folder_of_run = RunFolder(run_dir)
+    before = len(folder_of_run.metrics()) if folder_of_run.metrics_path.is_file() else 0
     begun = time.perf_counter()
     with subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as run:
         try:
-            while not rows.is_file() or len(read_metrics(rows)) <= before:
+            while not folder_of_run.metrics_path.is_file() or len(folder_of_run.metrics()) <= before:
                 if run.poll() is not None or time.perf_counter() - begun > PATIENCE:
                     raise RuntimeError(f"{' '.join(command)} logged nothing: exit code {run.poll()}")
                 time.sleep(POLL)

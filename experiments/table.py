@@ -17,7 +17,7 @@ from taic_jax.config import Config, walk
 from taic_jax.config_io import load_config
 from taic_jax.experiments.recovery import recovery_of
 from taic_jax.runtime.files import save_text
-from taic_jax.runtime.logging import read_metrics
+from taic_jax.runtime.run_folder import RunFolder
 
 TABLE = Path("experiments/results/evidence.jsonl")
 GRID = 50
@@ -115,7 +115,7 @@ def row_of(folder: Path, run_dir: Path, method: str, stage: str) -> dict[str, An
     ticks = {"collect": config.collect.ticks, "total": config.collect.ticks + config.train.ticks}
     ticks = ticks.get(stage, config.train.ticks)
     grid = np.arange(1, GRID + 1) * (ticks // GRID)
-    logged = [row for row in read_metrics(folder / "metrics.jsonl") if row["stage"] == stage]
+    logged = RunFolder(folder).metrics(stage)
     curves, numbers = curves_of(logged, stage, grid), {}
     if config.env.change_after:
         shares, numbers = recovery_of(logged, stage)

@@ -33,14 +33,12 @@ from taic_jax.options.execution import IdentityExecutor, make_executor
 from taic_jax.options.model import Networks, OptionModel, make_networks
 from taic_jax.rl.normalize import Statistics
 from taic_jax.runtime.devices import make_devices
-from taic_jax.runtime.driver import CLOCK, Clock, Run, drive
+from taic_jax.runtime.driver import Run, drive
 from taic_jax.runtime.files import save_text
-from taic_jax.runtime.logging import RunLogger
-from taic_jax.runtime.run_folder import check_folder, claimed, log_folder, prepare_folder
+from taic_jax.runtime.run_folder import RunFolder
 from taic_jax.summary import as_summary, write_video
 from taic_jax.tasks import make_envs
 from taic_jax.trainer import FineTuneTrainer, Trained, Trainer
-from taic_jax.types import as_rows
 
 STEPS_PER_LOG = 100
 
@@ -67,7 +65,7 @@ def run_pipeline(
       resume: go on with the run in the folder.
       overwrite: replace it.
       quiet: show no progress on standard error.
-      **settings: the `signals`, `checkpoint_seconds` and `population` of `stage.Run`.
+      **settings: the `signals`, `checkpoint_seconds` and `population` of `Run`.
 
     Raises:
       Interrupted: a signal was received; resume goes on from where it came.
@@ -78,15 +76,9 @@ def run_pipeline(
     devices = make_devices(shard, config)
     env, source = make_envs(config)
     model, policy = take_over(config, env, source)  # what is refused is refused before anything is written
-    prepare_folder(config, run_dir, resume=resume, overwrite=overwrite)
-    points = points or (config,)
-    # Seed k of a run is seed 0 of a run whose seed is k more.
-    keys = jnp.stack([jax.random.key(config.seed + k) for _ in points for k in range(config.seeds)])
-    model, policy = _for_points((model, policy), len(points))
-    with claimed(run_dir), log_folder(run_dir) as logs, RunLogger(logs, quiet=quiet) as logger:
-        clock = Clock.load(run_dir / CLOCK)
-        run = Run(as_rows(points, config.seeds), keys, run_dir, logger, clock, devices=devices, **settings)
-        logger.truncate("evaluate", -1)
+    model, policy = _for_points((model, policy), len(points or (config,)))
+    settings |= {"points": points, "resume": resume, "overwrite": overwrite, "quiet": quiet, "devices": devices}
+    with Run.open(config, run_dir, **settings) as run:
         collector = collect(run, source) if needs_collect(config) else None
         model = learn(run, source) if model is None else model
         methods = {"taic": train_over_options(run, env, model)}
@@ -114,7 +106,7 @@ def check_run(
     env, source = make_envs(config)
     take_over(config, env, source)
     if run_dir:
-        check_folder(config, run_dir, resume=resume, overwrite=overwrite)
+        RunFolder(run_dir).check(config, resume=resume, overwrite=overwrite)
     return env, source
 
 

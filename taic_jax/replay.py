@@ -1,6 +1,5 @@
 """Show again how numbers stopped being finite: take the one step that failed from the state that was dumped."""
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -8,17 +7,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from taic_jax.artifacts.models import DESCRIPTION, load_options
+from taic_jax.artifacts.models import load_options
+from taic_jax.config import replace
 from taic_jax.config_io import load_config
 from taic_jax.envs.base import Env
 from taic_jax.nonfinite import FINITE, QUANTITIES
 from taic_jax.options.model import make_networks
 from taic_jax.pipeline import learn_over_rows, over_rows, select_windows, step_over_rows
 from taic_jax.runtime.checkpoint import ArtifactError, load_tree
-from taic_jax.runtime.driver import Clock, Run
-from taic_jax.runtime.logging import RunLogger
+from taic_jax.runtime.driver import Run
+from taic_jax.runtime.files import read_description
 from taic_jax.tasks import make_envs
-from taic_jax.types import as_arrays, as_rows
+from taic_jax.types import as_arrays
 
 FIELDS = ("stage", "seed", "seeds", "step", "after", "quantity")
 
@@ -36,11 +36,9 @@ def replay(dump: Path) -> str | None:
     run_dir = dump.absolute().parents[1]
     config = load_config(run_dir / "config.yaml")
     env, source = make_envs(config)
-    keys = jnp.stack([jax.random.key(config.seed + k) for k in range(told["seeds"])])
-    with RunLogger(run_dir, quiet=True) as logger:
-        # As many seeds as there were, all in this state and of this point: the program is the one that failed.
-        row = load_tree(dump / "config", jax.eval_shape(as_arrays, config))
-        run = Run(as_rows([row], told["seeds"]), keys, run_dir, logger, Clock())
+    # As many seeds as there were, all in this state and of this point: the program is the one that failed.
+    point = load_tree(dump / "config", jax.eval_shape(as_arrays, config))
+    with Run.view(replace(config, "seeds", told["seeds"]), run_dir, point) as run:
         step, like, args = _stage(run, env, source, told["stage"])
         state = load_tree(dump / "state", jax.eval_shape(lambda rows: jax.tree.map(lambda x: x[0], rows), like))
         states = jax.tree.map(lambda x: jnp.broadcast_to(x, (told["seeds"], *x.shape)), state)
@@ -68,11 +66,8 @@ def _stage(run: Run, env: Env, source: Env, stage: str) -> tuple[Any, Any, tuple
 
 
 def _read(dump: Path) -> dict[str, Any]:
-    try:
-        told = json.loads((dump / DESCRIPTION).read_text())
-    except (OSError, ValueError):
-        told = None
-    if not isinstance(told, dict) or not set(FIELDS) <= set(told):
+    told = read_description(dump)
+    if not told or not set(FIELDS) <= set(told):
         raise ArtifactError(f"{dump}: expected a folder under dumps of a run, where a seed stopped; got none")
     return told
 

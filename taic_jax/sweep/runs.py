@@ -19,9 +19,8 @@ from taic_jax.config import Config, replace
 from taic_jax.config_io import to_yaml
 from taic_jax.pipeline import run_pipeline
 from taic_jax.runtime.files import save_text
-from taic_jax.runtime.logging import read_metrics
 from taic_jax.runtime.pbt import Population, schedule
-from taic_jax.runtime.run_folder import LOCK, RunFolderError, claimed, prepare_folder
+from taic_jax.runtime.run_folder import LOCK, RunFolder, RunFolderError
 from taic_jax.runtime.signals import DivergedError
 from taic_jax.sweep.axes import Axis, chunks, configs_of, show
 from taic_jax.sweep.marginals import draw_marginals
@@ -78,8 +77,8 @@ def run_sweep(
     if plan.pbt:
         bounds = {axis.name: axis.bounds for axis in axes}
         settings["population"] = Population(plan.pbt, bounds, config.seeds)
-    prepare_folder(config, run_dir, resume=resume, overwrite=overwrite)
-    with claimed(run_dir):
+    RunFolder(run_dir).prepare(config, resume=resume, overwrite=overwrite)
+    with RunFolder(run_dir).claimed():
         plan = _resumed(plan, run_dir) if resume else plan
         plan.save(run_dir)
         if resume and (run_dir / BEST).is_file():
@@ -118,7 +117,7 @@ def _best_member(config: Config, plan: Plan, run_dir: Path) -> str:
         json.loads((folder / "summary.json").read_text())["methods"]["taic"]["return"]["per_seed"], float
     )
     best = int(np.nanargmax(returns))
-    rows = [row for row in read_metrics(folder / "metrics.jsonl") if row["stage"] == "train"]
+    rows = RunFolder(folder).metrics("train")
     found = schedule(rows, list(plan.points[0]), best)
     print(f"best: {show(found[-1][1])} at the end: {returns[best]:.4g}, point {plan.chunks[0][best // config.seeds]}")
     lines = [f"# from tick {tick}: {show(point)}\n" for tick, point in found]
