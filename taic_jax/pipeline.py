@@ -77,8 +77,9 @@ def run_pipeline(
     env, source = make_envs(config)
     model, policy = take_over(config, env, source)  # what is refused is refused before anything is written
     model, policy = _for_points((model, policy), len(points or (config,)))
-    settings |= {"points": points, "resume": resume, "overwrite": overwrite, "quiet": quiet, "devices": devices}
-    with Run.open(config, run_dir, **settings) as run:
+    with Run.open(
+        config, run_dir, points=points, resume=resume, overwrite=overwrite, quiet=quiet, devices=devices, **settings
+    ) as run:
         collector = collect(run, source) if needs_collect(config) else None
         model = learn(run, source) if model is None else model
         methods = {"taic": train_over_options(run, env, model)}
