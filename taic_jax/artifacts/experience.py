@@ -131,6 +131,6 @@ def gather_experience(source: Path, env: Env | Body, seeds: int) -> Experience:
             raise ArtifactError(f"{source}: expected a run that collected experience, or demonstrations; got none")
         demonstrations = read_demonstrations(source, env.proprioceptive_size, env.action_size)
         return jax.tree.map(lambda x: jnp.broadcast_to(x, (seeds, *x.shape)), demonstrations)
-    description = check_description(folder, "experience", env)
+    description = check_description(folder, "experience", env, {})
     columns = [read_experience(folder, seed % description["seeds"]) for seed in range(seeds)]
     return jax.tree.map(lambda *x: jnp.stack(x), *columns)

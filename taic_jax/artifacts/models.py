@@ -3,9 +3,7 @@
 An artifact is a folder: the tree of arrays with leading axis K (one per seed), and `description.json`.
 """
 
-from collections.abc import Mapping
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import jax
@@ -60,9 +58,7 @@ def describe(env: Env | Body) -> dict[str, Any]:
     }
 
 
-def check_description(
-    folder: Path, kind: str, env: Env | Body, structure: Mapping[str, Any] = MappingProxyType({})
-) -> dict[str, Any]:
+def check_description(folder: Path, kind: str, env: Env | Body, structure: dict[str, Any]) -> dict[str, Any]:
     """Return the description of an artifact, if it is of the body of `env` and of this structure.
 
     Raises:
