@@ -163,7 +163,8 @@ class Run:
 
     def _dump(self, stage: str, guard: Guarded, unit: int, seed: int) -> None:
         """Save the last good state of a seed for `--replay`, and say that it has stopped."""
-        step, quantity = int(guard.step[seed]), QUANTITIES[guard.code[seed]]
+        code, step = (int(x[seed]) for x in jax.device_get((guard.code, guard.step)))
+        quantity = QUANTITIES[code]
         description = {"stage": stage, "seed": seed, "seeds": len(self.keys), "step": step}
         description |= {"after": step * unit, "quantity": quantity}
         folder = self.dir / DUMPS / f"{stage}-{step * unit}-seed{seed}"
