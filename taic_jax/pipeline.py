@@ -1,7 +1,6 @@
 """The main job: collect experience, learn options, train a policy over them, evaluate."""
 
 import dataclasses
-import json
 import sys
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -34,10 +33,8 @@ from taic_jax.options.dataset import Dataset, Experience, holds_out, make_datase
 from taic_jax.options.model import OptionModel
 from taic_jax.rl.normalize import Statistics
 from taic_jax.runtime.devices import make_devices
-from taic_jax.runtime.driver import CLOCK, Clock, Run, drive
-from taic_jax.runtime.files import save_text
-from taic_jax.runtime.logging import RunLogger
-from taic_jax.runtime.run_folder import check_folder, claimed, log_folder, prepare_folder
+from taic_jax.runtime.driver import Run, drive
+from taic_jax.runtime.run_folder import RunFolder, Summary
 from taic_jax.summary import as_summary, write_video
 from taic_jax.trainer import (
     Trained,
@@ -49,7 +46,6 @@ from taic_jax.trainer import (
     step_rows,
     steps_per_log,
 )  # fmt: skip
-from taic_jax.types import as_rows
 
 
 def run_pipeline(
@@ -62,7 +58,7 @@ def run_pipeline(
     overwrite: bool = False,
     quiet: bool = False,
     **settings: Any,
-) -> dict:
+) -> Summary:
     """Run every stage that is not done yet and return the summary, also written to `summary.json`.
 
     Args:
@@ -74,7 +70,7 @@ def run_pipeline(
       resume: go on with the run in the folder.
       overwrite: replace it.
       quiet: show no progress on standard error.
-      **settings: the `signals`, `checkpoint_seconds` and `population` of `stage.Run`.
+      **settings: the `signals`, `checkpoint_seconds` and `population` of `Run`.
 
     Raises:
       Interrupted: a signal was received; resume goes on from where it came.
@@ -85,15 +81,10 @@ def run_pipeline(
     devices = make_devices(shard, config)
     env, source = make_envs(config)
     model, policy = take_over(config, env, source)  # what is refused is refused before anything is written
-    prepare_folder(config, run_dir, resume=resume, overwrite=overwrite)
-    points = points or (config,)
-    # Seed k of a run is seed 0 of a run whose seed is k more.
-    keys = jnp.stack([jax.random.key(config.seed + k) for _ in points for k in range(config.seeds)])
-    model, policy = _for_points((model, policy), len(points))
-    with claimed(run_dir), log_folder(run_dir) as logs, RunLogger(logs, quiet=quiet) as logger:
-        clock = Clock.load(run_dir / CLOCK)
-        run = Run(as_rows(points, config.seeds), keys, run_dir, logger, clock, devices=devices, **settings)
-        logger.truncate("evaluate", -1)
+    model, policy = _for_points((model, policy), len(points or (config,)))
+    with Run.open(
+        config, run_dir, points=points, resume=resume, overwrite=overwrite, quiet=quiet, devices=devices, **settings
+    ) as run:
         collector = collect(run, source) if needs_collect(config) else None
         model = learn(run, source) if model is None else model
         methods = {"taic": train_over_options(run, env, model)}
@@ -102,7 +93,7 @@ def run_pipeline(
             done = collector if name == "flat" and collector_is_baseline(config) else None
             methods[name] = done or train_baseline(run, env, name, policy)
     summary = as_summary(run, {name: {"first": x.first, "last": x.last} for name, x in methods.items()})
-    save_text(run_dir / "summary.json", json.dumps(summary, indent=2) + "\n")
+    run.folder.save_summary(summary)
     try:
         write_video(run, env, methods["taic"].agent)
     except RenderingError as error:  # nothing else depends on it, and all results are saved
@@ -121,7 +112,7 @@ def check_run(
     env, source = make_envs(config)
     take_over(config, env, source)
     if run_dir:
-        check_folder(config, run_dir, resume=resume, overwrite=overwrite)
+        RunFolder(run_dir).check(config, resume=resume, overwrite=overwrite)
     return env, source
 
 

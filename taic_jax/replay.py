@@ -1,6 +1,5 @@
 """Show again how numbers stopped being finite: take the one step that failed from the state that was dumped."""
 
-import json
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -9,17 +8,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from taic_jax.artifacts.models import DESCRIPTION, load_options
-from taic_jax.config import COLLECT
-from taic_jax.config_io import load_config
+from taic_jax.artifacts.models import load_options
+from taic_jax.config import COLLECT, replace
 from taic_jax.envs.base import Env
 from taic_jax.nonfinite import FINITE, QUANTITIES
 from taic_jax.pipeline import make_envs, select_windows
 from taic_jax.runtime.checkpoint import ArtifactError, load_tree
-from taic_jax.runtime.driver import Clock, Run
-from taic_jax.runtime.logging import RunLogger
+from taic_jax.runtime.driver import Run
+from taic_jax.runtime.files import read_description
+from taic_jax.runtime.run_folder import RunFolder
 from taic_jax.trainer import init_learning, init_rows, learn_rows, make_trainer, step_rows
-from taic_jax.types import as_arrays, as_rows
+from taic_jax.types import as_arrays
 
 FIELDS = ("stage", "seed", "seeds", "step", "after", "quantity")
 
@@ -35,13 +34,11 @@ def replay(dump: Path) -> str | None:
     """
     dumped = _read(dump)
     run_dir = dump.absolute().parents[1]
-    config = load_config(run_dir / "config.yaml")
+    config = RunFolder(run_dir).config()
     env, source = make_envs(config)
-    keys = jnp.stack([jax.random.key(config.seed + k) for k in range(dumped["seeds"])])
-    with RunLogger(run_dir, quiet=True) as logger:
-        # As many seeds as there were, all in this state and of this point: the program is the one that failed.
-        row = load_tree(dump / "config", jax.eval_shape(as_arrays, config))
-        run = Run(as_rows([row], dumped["seeds"]), keys, run_dir, logger, Clock())
+    # As many seeds as there were, all in this state and of this point: the program is the one that failed.
+    point = load_tree(dump / "config", jax.eval_shape(as_arrays, config))
+    with Run.view(replace(config, "seeds", dumped["seeds"]), run_dir, point) as run:
         step, like, args = _stage(run, env, source, dumped["stage"])
         state = load_tree(dump / "state", jax.eval_shape(lambda rows: jax.tree.map(lambda x: x[0], rows), like))
         states = jax.tree.map(lambda x: jnp.broadcast_to(x, (dumped["seeds"], *x.shape)), state)
@@ -66,11 +63,8 @@ def _stage(run: Run, env: Env, source: Env, stage: str) -> tuple[Any, Any, tuple
 
 
 def _read(dump: Path) -> dict[str, Any]:
-    try:
-        dumped = json.loads((dump / DESCRIPTION).read_text())
-    except (OSError, ValueError):
-        dumped = None
-    if not isinstance(dumped, dict) or not set(FIELDS) <= set(dumped):
+    dumped = read_description(dump)
+    if not dumped or not set(FIELDS) <= set(dumped):
         raise ArtifactError(f"{dump}: expected a folder under dumps of a run, where a seed stopped; got none")
     return dumped
 

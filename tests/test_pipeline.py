@@ -34,7 +34,7 @@ from taic_jax.pipeline import make_envs, run_pipeline
 from taic_jax.runtime import driver
 from taic_jax.runtime.checkpoint import Checkpoints, load_arrays
 from taic_jax.runtime.logging import RunLogger
-from taic_jax.runtime.run_folder import BusyError, RunFolderError, claimed
+from taic_jax.runtime.run_folder import BusyError, RunFolder, RunFolderError
 from taic_jax.trainer import init_rows, make_trainer
 from taic_jax.types import as_rows
 
@@ -132,8 +132,8 @@ def test_refuses_folders_that_are_not_its_own(finished, tmp_path):
 CLAIM = """
 import sys
 from pathlib import Path
-from taic_jax.runtime.run_folder import claimed
-with claimed(Path(sys.argv[1])):
+from taic_jax.runtime.run_folder import RunFolder
+with RunFolder(Path(sys.argv[1])).claimed():
     print("claimed", flush=True)
     sys.stdin.read()
 """
@@ -144,15 +144,15 @@ def test_a_folder_is_given_back_by_a_process_that_is_killed(tmp_path):
         [sys.executable, "-c", CLAIM, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     )
     assert child.stdout and child.stdin and child.stdout.readline() == "claimed\n"
-    with pytest.raises(BusyError, match="is being written by another process"), claimed(tmp_path):
+    with pytest.raises(BusyError, match="is being written by another process"), RunFolder(tmp_path).claimed():
         pytest.fail("two processes at one folder")
     child.kill()
     child.wait()
     child.stdout.close()
     child.stdin.close()
-    with claimed(tmp_path), pytest.raises(BusyError), claimed(tmp_path):
+    with RunFolder(tmp_path).claimed(), pytest.raises(BusyError), RunFolder(tmp_path).claimed():
         pytest.fail("two runs of one process at one folder")
-    with claimed(tmp_path):
+    with RunFolder(tmp_path).claimed():
         pass
 
 
@@ -231,8 +231,6 @@ def test_experience_without_the_windows_that_are_needed_is_refused(tmp_path, mon
     experience = Experience(obs, action, reward=obs[..., 0], done=jnp.zeros((1, 160, 1), bool))
     monkeypatch.setattr(pipeline, "gather_experience", lambda *_: experience)
     options = dataclasses.replace(CONFIG.options, termination="predict", since=since, until=until)
-    config = as_rows([dataclasses.replace(CONFIG, options=options, seeds=1)], 1)
-    with RunLogger(tmp_path) as logger, pytest.raises(ConfigError, match=message):
-        pipeline.learn(
-            driver.Run(config, jax.random.split(jax.random.key(0), 1), tmp_path, logger, driver.Clock()), env
-        )
+    config = dataclasses.replace(CONFIG, options=options, seeds=1)
+    with driver.Run.open(config, tmp_path) as run, pytest.raises(ConfigError, match=message):
+        pipeline.learn(run, env)

@@ -4,7 +4,6 @@ import json
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from tiny_runs import (
@@ -23,7 +22,7 @@ from taic_jax import nonfinite, pipeline
 from taic_jax.config import Config, ConfigError, collector_is_baseline, needs_collect
 from taic_jax.pipeline import make_envs, run_pipeline
 from taic_jax.runtime.checkpoint import Checkpoints, load_arrays
-from taic_jax.runtime.driver import STAGES
+from taic_jax.runtime.driver import STAGE_STREAMS
 from taic_jax.summary import plan
 
 QUIET = with_fields(CONFIG, evaluate__video_ticks=0)
@@ -94,7 +93,7 @@ def test_frozen_options_are_what_acts_and_stay_as_they_are(source, transferred, 
     assert methods_of(tmp_path / "run") == {"taic": methods_of(transferred)["taic"]}
 
 
-def test_the_transferred_policy_starts_where_the_source_run_ended(source, transferred, monkeypatch):
+def test_the_transferred_policy_starts_where_the_source_run_ended(source, tmp_path, monkeypatch):
     """nav2d observes the slice alone, nav2d_random the goal besides: the first two rows of weights carry over."""
     config, states = using(source), []
 
@@ -106,9 +105,7 @@ def test_the_transferred_policy_starts_where_the_source_run_ended(source, transf
     env = make_envs(config)[0]
     _, policy = pipeline.take_over(config, env, env)
     monkeypatch.setattr(pipeline, "drive", drive)
-    keys = jnp.stack([jax.random.key(k) for k in range(2)])
-    with pipeline.RunLogger(transferred.with_name("unused")) as logger:
-        run = pipeline.Run(pipeline.as_rows([config], 2), keys, transferred, logger, pipeline.Clock())
+    with pipeline.Run.open(config, tmp_path) as run:
         pipeline.train_baseline(run, env, "transfer", policy)
     saved, (start,) = load_arrays(source / "policy"), states
     first, second = (saved[f"0.actor.params.Dense_{i}.kernel"] for i in range(2))
@@ -136,7 +133,7 @@ def test_baselines_take_their_ticks_and_hold_their_actions(source, tmp_path):
     run_pipeline(using(source, seeds=3, collect__ticks=64, train__baselines=("flat", "repeat", "total")), tmp_path)
     assert stages_of(tmp_path) == {"train", "flat", "repeat", "total"}
     assert list(methods_of(tmp_path)) == ["taic", "flat", "repeat", "total"]
-    rows = {name: [row for row in rows_of(tmp_path) if row["stage"] == name] for name in STAGES}
+    rows = {name: [row for row in rows_of(tmp_path) if row["stage"] == name] for name in STAGE_STREAMS}
     thrice = [16, 32, 48]
     assert {name: [row["ticks"] for row in rows[name]] for name in ("flat", "repeat", "total")} == {
         "flat": thrice,

@@ -13,7 +13,7 @@ from taic_jax import pipeline
 from taic_jax.config import CollectConfig, Config, EvaluateConfig, OptionsConfig, PPOConfig, TrainConfig
 from taic_jax.runtime import driver
 from taic_jax.runtime.checkpoint import Checkpoints, load_arrays
-from taic_jax.runtime.logging import read_metrics
+from taic_jax.runtime.run_folder import RunFolder
 
 PPO = PPOConfig(num_envs=2, rollout_length=8, epochs=1, minibatch_size=16, hidden_sizes=(4,))
 CONFIG = Config(
@@ -83,7 +83,7 @@ def files_of(folder: Path) -> dict[str, bytes]:
 
 def rows_of(folder: Path) -> list[dict]:
     """Return the rows of the metrics in one order, without the time they were written."""
-    rows = [{**row, "time": None} for row in read_metrics(folder / "metrics.jsonl")]
+    rows = [{**row, "time": None} for row in RunFolder(folder).metrics()]
     return sorted(rows, key=lambda row: (row["stage"], row.get("ticks", row.get("steps")), sorted(row)))
 
 

@@ -8,14 +8,11 @@ its last checkpoint.
 """
 
 import dataclasses
-import json
 import sys
 from collections.abc import Sequence, Set
 from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import tyro
 
 from taic_jax.command_line import tell
@@ -25,13 +22,10 @@ from taic_jax.experiments.evidence.plan import PATHS, SPACES, Cell, Key, all_cel
 from taic_jax.experiments.evidence.table import TABLE, TableError, append_row, config_hash, read_table, row_of
 from taic_jax.pipeline import collect, make_envs, run_pipeline, take_over, train_baseline
 from taic_jax.runtime.devices import Devices, make_devices, open_devices
-from taic_jax.runtime.driver import CLOCK, Clock, Run
-from taic_jax.runtime.files import save_text
-from taic_jax.runtime.logging import RunLogger
+from taic_jax.runtime.driver import Run
 from taic_jax.runtime.program_cache import keep_programs
-from taic_jax.runtime.run_folder import RunFolder, claimed, prepare_folder
+from taic_jax.runtime.run_folder import RunFolder
 from taic_jax.summary import as_summary
-from taic_jax.types import as_rows
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,7 +71,7 @@ def do(cell: Cell, run_dir: Path, shard: Shard = "none") -> None:
     folder = run_dir / cell.name
     run = RunFolder(folder)
     if run.finished:
-        prepare_folder(cell.config, folder, resume=True)  # only checks that it is this run
+        run.prepare(cell.config, resume=True)  # only checks that it is this run
     elif len(cell.stages) == 1 and not set(cell.stages.values()) & {"train", "options"}:
         (stage,) = cell.stages.values()
         run_flat(cell, folder, stage, make_devices(shard, cell.config), run.begun)
@@ -103,15 +97,9 @@ def run_flat(cell: Cell, folder: Path, stage: str, devices: Devices, resume: boo
     config = cell.config
     env, source = make_envs(config)
     _, policy = take_over(config, env, source)
-    prepare_folder(config, folder, resume=resume)
-    keys = jnp.stack([jax.random.key(config.seed + k) for k in range(config.seeds)])
-    with claimed(folder), RunLogger(folder) as logger:
-        clock = Clock.load(folder / CLOCK)
-        run = Run(as_rows([config], config.seeds), keys, folder, logger, clock, devices=devices)
-        logger.truncate("evaluate", -1)
+    with Run.open(config, folder, resume=resume, devices=devices) as run:
         trained = collect(run, source) if stage == "collect" else train_baseline(run, env, stage, policy)
-    summary = as_summary(run, {stage: {"first": trained.first, "last": trained.last}})
-    save_text(folder / "summary.json", json.dumps(summary, indent=2) + "\n")
+    run.folder.save_summary(as_summary(run, {stage: {"first": trained.first, "last": trained.last}}))
 
 
 def show(cells: Sequence[Cell], rows: dict[Key, dict[str, Any]], arguments: Arguments) -> None:

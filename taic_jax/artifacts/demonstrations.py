@@ -7,7 +7,7 @@ import contextlib
 import difflib
 import json
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,8 @@ TOLERANCE = 1e-3  # how far an action may stand outside [-1, 1] and is clipped; 
 HDF5_SUFFIXES = (".hdf5", ".h5")
 SUPPORTED = "an .npz file, an .hdf5 file, or a Minari dataset's folder with data_format hdf5"
 MAIN_FILE = "main_data.hdf5"
+NPZ_NAMES = ("obs", "action", "reward", "done")
+HDF5_NAMES = ("observations", "actions", "rewards", "terminations", "truncations")
 EPISODE = re.compile("episode_(0|[1-9][0-9]*)")
 
 
@@ -45,10 +47,11 @@ def read_demonstrations(path: Path, proprioceptive_size: int, action_size: int) 
     """
     with _reading(path):
         path = _find_file(path)
+    sizes = proprioceptive_size, action_size
     if path.suffix.lower() == ".npz":
-        action_name, episodes = "action", [_read_npz(path, proprioceptive_size, action_size)]
+        action_name, episodes = NPZ_NAMES[1], [_read_npz(path, sizes)]
     elif path.suffix.lower() in HDF5_SUFFIXES:
-        action_name, episodes = "actions", _read_hdf5(path, proprioceptive_size, action_size)
+        action_name, episodes = HDF5_NAMES[1], _read_hdf5(path, sizes)
     else:
         raise ArtifactError(f"{path}: unknown kind of file {path.suffix!r}; supported: {SUPPORTED}")
     if sum(len(episode.reward) for episode in episodes) == 0:
@@ -61,11 +64,9 @@ def _find_file(path: Path) -> Path:
     """Return the file that holds the arrays: `path` itself, or Minari's main file in the folder `path`."""
     if not path.exists():
         raise ArtifactError(f"{path}: expected demonstrations, got nothing")
-    return _main_file(path) if path.is_dir() else path
-
-
-def _main_file(folder: Path) -> Path:
-    data = folder / "data" if (folder / "data").is_dir() else folder
+    if not path.is_dir():
+        return path
+    data = path / "data" if (path / "data").is_dir() else path
     metadata = data / "metadata.json"
     if metadata.exists():
         with _reading(metadata):
@@ -74,30 +75,23 @@ def _main_file(folder: Path) -> Path:
         if layout != "hdf5":
             raise ArtifactError(f"{metadata}: expected hdf5 at data_format, got {layout!r}; supported: {SUPPORTED}")
     if not (data / MAIN_FILE).exists():
-        raise ArtifactError(f"{folder}: expected {MAIN_FILE} or data/{MAIN_FILE} in it; supported: {SUPPORTED}")
+        raise ArtifactError(f"{path}: expected {MAIN_FILE} or data/{MAIN_FILE} in it; supported: {SUPPORTED}")
     return data / MAIN_FILE
 
 
-def _read_npz(path: Path, proprioceptive_size: int, action_size: int) -> Experience:
+def _read_npz(path: Path, sizes: tuple[int, int]) -> Experience:
     """Return all ticks of a NumPy file, leading axis N."""
-    stored: dict[str, np.ndarray] = {}
     with _reading(path), path.open("rb") as file:
         if file.read(2) != b"PK":
             raise ArtifactError(f"{path}: expected an .npz file as np.savez writes it, got another kind of file")
         file.seek(0)
         with np.load(file, allow_pickle=False) as archive:
-            for name in ("obs", "action", "reward", "done"):
-                _require(path, name, archive.files)
-                stored[name] = archive[name]
-    action = _numbers(f"{path}: action", stored["action"], (_length(stored["action"]), action_size))
-    obs = _numbers(f"{path}: obs", stored["obs"], (len(action), proprioceptive_size), longer=True)
-    reward = _numbers(f"{path}: reward", stored["reward"], (len(action),))
-    done = _flags(f"{path}: done", stored["done"], len(action))
-    done[-1:] = True
-    return Experience(obs, action, reward, done)
+            _require(path, NPZ_NAMES, archive.files)
+            sources = {name: archive[name] for name in NPZ_NAMES}
+    return _as_experience(f"{path}: ", sources, sizes)
 
 
-def _read_hdf5(path: Path, proprioceptive_size: int, action_size: int) -> list[Experience]:
+def _read_hdf5(path: Path, sizes: tuple[int, int]) -> list[Experience]:
     """Return the episodes of a Minari file in the order of their numbers, each with leading axis n."""
     try:
         import h5py
@@ -107,39 +101,40 @@ def _read_hdf5(path: Path, proprioceptive_size: int, action_size: int) -> list[E
         numbers = sorted(int(name[8:]) for name in map(str, file) if EPISODE.fullmatch(name))
         if not numbers:
             raise ArtifactError(f"{path}: expected groups episode_0, episode_1, ..., got none")
-        return [
-            _read_episode(f"{path}: episode_{number}", file[f"episode_{number}"], proprioceptive_size, action_size)
-            for number in numbers
-        ]
+        return [_read_episode(f"{path}: episode_{n}", file[f"episode_{n}"], sizes) for n in numbers]
 
 
-def _read_episode(where: str, group: Any, proprioceptive_size: int, action_size: int) -> Experience:
+def _read_episode(where: str, group: Any, sizes: tuple[int, int]) -> Experience:
     if not hasattr(group, "keys"):
         raise ArtifactError(f"{where}: expected a group, got an array")
-    for name in ("observations", "actions", "rewards", "terminations", "truncations"):
-        _require(where, name, group.keys())
-    obs, obs_name = group["observations"], "observations"
+    _require(where, HDF5_NAMES, group.keys())
+    obs_name, *others = HDF5_NAMES
+    obs = group[obs_name]
     if hasattr(obs, "keys"):
-        _require(f"{where}/observations", "observation", obs.keys())
-        obs, obs_name = obs["observation"], "observations/observation"
-    action = _numbers(f"{where}/actions", group["actions"], (_length(group["actions"]), action_size))
-    obs = _numbers(f"{where}/{obs_name}", obs, (len(action) + 1, proprioceptive_size), longer=True)
-    reward = _numbers(f"{where}/rewards", group["rewards"], (len(action),))
-    done, cut = [_flags(f"{where}/{name}", group[name], len(action)) for name in ("terminations", "truncations")]
-    done |= cut
+        _require(f"{where}/{obs_name}", ["observation"], obs.keys())
+        obs_name, obs = f"{obs_name}/observation", obs["observation"]
+    return _as_experience(f"{where}/", {obs_name: obs, **{name: group[name] for name in others}}, sizes, num_last=1)
+
+
+def _as_experience(where: str, sources: dict[str, Any], sizes: tuple[int, int], num_last: int = 0) -> Experience:
+    """Check and join arrays by name: observations, actions, rewards, and all that mark an end.
+
+    The `num_last` observations after the last tick start no tick, and are left out.
+    """
+    obs, action, reward, *ends = ((f"{where}{name}", source) for name, source in sources.items())
+    shape = getattr(action[1], "shape", None)
+    count = shape[0] if shape else 0  # of what is no array, the checks refuse anything
+    actions = _numbers(*action, (count, sizes[1]))
+    states = _numbers(*obs, (count + num_last, sizes[0]), longer=True)
+    rewards = _numbers(*reward, (count,))
+    done = np.logical_or.reduce([_flags(*end, count) for end in ends])
     done[-1:] = True
-    return Experience(obs[:-1], action, reward, done)  # the state after the last tick starts no tick
+    return Experience(states[:count], actions, rewards, done)
 
 
-def _length(source: Any) -> int:
-    """Return the leading size of an array; 0 of anything else, which the checks refuse."""
-    shape = getattr(source, "shape", None)
-    return shape[0] if shape else 0
-
-
-def _require(where: str | Path, name: str, names: Iterable[str]) -> None:
-    names = list(names)
-    if name not in names:
+def _require(where: str | Path, required: Sequence[str], present: Iterable[str]) -> None:
+    names = list(present)
+    for name in (name for name in required if name not in names):
         nearest = difflib.get_close_matches(name, names, n=1, cutoff=0.0)
         hint = f"; the nearest name is {nearest[0]!r}" if nearest else ""
         raise ArtifactError(f"{where}: expected {name} in it, got nothing{hint}")

@@ -4,10 +4,11 @@ A file holds the newest T ticks of every environment and seed, so a run that is 
 iteration it was in, and a resumed one writes the same files again.
 """
 
-import json
+import dataclasses
 import zipfile
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Key
 
 from taic_jax.artifacts.demonstrations import read_demonstrations
-from taic_jax.artifacts.models import DESCRIPTION, Body, read_description
+from taic_jax.artifacts.models import Body, check_description
 from taic_jax.config import CollectConfig, experience_ticks
 from taic_jax.envs.base import Env
 from taic_jax.options.dataset import Experience
@@ -23,11 +24,10 @@ from taic_jax.options.execution import IdentityExecutor
 from taic_jax.rl import ppo
 from taic_jax.rl.rollout import Rollout
 from taic_jax.runtime.checkpoint import ArtifactError
-from taic_jax.runtime.files import save_text, whole_file, writing
+from taic_jax.runtime.files import DESCRIPTION, save_description, whole_file, writing
 from taic_jax.types import as_arrays
 
 EXPERIENCE = "experience"
-FIELDS = ("obs", "action", "reward", "done")
 
 
 def as_experience(ticks: Rollout, proprioceptive_size: int) -> Experience:
@@ -45,7 +45,11 @@ def collect(config: CollectConfig, env: Env, key: Key[Array, ""]) -> tuple[ppo.A
     executor = IdentityExecutor(env.action_size)
     count = ppo.num_iterations(config.ppo, config.ticks)
     late = min(num_blocks(config), count)
-    step = partial(_iteration, config, env, executor, count)
+
+    def step(keep: bool, state: ppo.TrainState, _: None) -> tuple[ppo.TrainState, Any]:
+        state, metrics, ticks, _judgement = ppo.iterate(config.ppo, env, executor, count, state)
+        return state, (metrics, as_experience(ticks, env.proprioceptive_size) if keep else None)
+
     state, metrics = ppo.init(config.ppo, env, executor, key), []
     if late < count:  # what is too early to be kept
         state, (early, _) = jax.lax.scan(partial(step, False), state, None, count - late)
@@ -54,19 +58,6 @@ def collect(config: CollectConfig, env: Env, key: Key[Array, ""]) -> tuple[ppo.A
     metrics = jax.tree.map(lambda *parts: jnp.concatenate(parts), *metrics, last)
     experience = jax.tree.map(lambda x: x.reshape((-1, *x.shape[2:])), blocks)
     return ppo.as_agent(config.ppo, executor, state), metrics, experience
-
-
-def _iteration(
-    config: CollectConfig,
-    env: Env,
-    executor: IdentityExecutor,
-    count: int,
-    keep: bool,
-    state: ppo.TrainState,
-    _: None,
-) -> tuple[ppo.TrainState, tuple[dict[str, Array], Experience | None]]:
-    state, metrics, ticks, _judgement = ppo.iterate(config.ppo, env, executor, count, state)
-    return state, (metrics, as_experience(ticks, env.proprioceptive_size) if keep else None)
 
 
 def num_blocks(config: CollectConfig) -> int:
@@ -92,7 +83,7 @@ class ExperienceStore:
         self.folder, self.capacity = folder, capacity
         with writing(folder):
             folder.mkdir(parents=True, exist_ok=True)
-        save_text(folder / DESCRIPTION, json.dumps(description, indent=2) + "\n")
+        save_description(folder, description)
 
     def write(self, iteration: int, block: Experience) -> None:
         """Save the block of one iteration, whole or not at all, and drop the block that no longer fits.
@@ -102,7 +93,7 @@ class ExperienceStore:
         """
         path = self.folder / f"{iteration:06d}.npz"
         with whole_file(path) as file:
-            np.savez(file, obs=block.obs, action=block.action, reward=block.reward, done=block.done)
+            np.savez(file, **vars(block))
         with writing(path):
             (self.folder / f"{iteration - self.capacity:06d}.npz").unlink(missing_ok=True)
 
@@ -116,15 +107,14 @@ def read_experience(folder: Path, seed: int) -> Experience:
     paths = sorted(folder.glob("[0-9]*.npz"))
     if not paths:
         raise ArtifactError(f"{folder} holds no experience: no file like 000000.npz in it")
-    blocks: dict[str, list[np.ndarray]] = {name: [] for name in FIELDS}
+    blocks = []
     for path in paths:
         try:
             with path.open("rb") as file, np.load(file, allow_pickle=False) as block:
-                for name in FIELDS:
-                    blocks[name].append(block[name][seed])
+                blocks.append(Experience(*(block[field.name][seed] for field in dataclasses.fields(Experience))))
         except (OSError, EOFError, ValueError, KeyError, IndexError, zipfile.BadZipFile) as error:
             raise ArtifactError(f"{path} is no block of experience with seed {seed}: {error}") from None
-    return Experience(**{name: np.concatenate(arrays) for name, arrays in blocks.items()})
+    return jax.tree.map(lambda *parts: np.concatenate(parts), *blocks)
 
 
 def gather_experience(source: Path, env: Env | Body, seeds: int) -> Experience:
@@ -141,6 +131,6 @@ def gather_experience(source: Path, env: Env | Body, seeds: int) -> Experience:
             raise ArtifactError(f"{source}: expected a run that collected experience, or demonstrations; got none")
         demonstrations = read_demonstrations(source, env.proprioceptive_size, env.action_size)
         return jax.tree.map(lambda x: jnp.broadcast_to(x, (seeds, *x.shape)), demonstrations)
-    description = read_description(folder, "experience", env)
+    description = check_description(folder, "experience", env, {})
     columns = [read_experience(folder, seed % description["seeds"]) for seed in range(seeds)]
     return jax.tree.map(lambda *x: jnp.stack(x), *columns)

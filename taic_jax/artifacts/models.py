@@ -3,7 +3,6 @@
 An artifact is a folder: the tree of arrays with leading axis K (one per seed), and `description.json`.
 """
 
-import json
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,10 +16,9 @@ from taic_jax.options.model import OptionModel, Scale, init_params, make_network
 from taic_jax.rl import normalize
 from taic_jax.rl.ppo import Agent, Policy
 from taic_jax.runtime.checkpoint import ArtifactError, load_tree, save_tree
-from taic_jax.runtime.files import save_text
+from taic_jax.runtime.files import DESCRIPTION, read_description, save_description
 
 OPTIONS, POLICY = "options", "policy"
-DESCRIPTION = "description.json"
 
 # What a frozen option model must agree in with the config that uses it: shapes, and how its parts are read.
 STRUCTURE = (
@@ -43,10 +41,10 @@ def described_body(folder: Path) -> Body:
     Raises:
       ArtifactError: it has none.
     """
+    description = read_description(folder) or {}
     try:
-        told = json.loads((folder / DESCRIPTION).read_text())
-        return Body(told["env"], *(told[name] for name in Body._fields[1:]))
-    except (OSError, ValueError, KeyError, TypeError):
+        return Body(description["env"], *(description[name] for name in Body._fields[1:]))
+    except KeyError:
         raise ArtifactError(f"{folder / DESCRIPTION}: expected the description of an artifact, got none") from None
 
 
@@ -60,22 +58,19 @@ def describe(env: Env | Body) -> dict[str, Any]:
     }
 
 
-def read_description(
-    folder: Path, kind: str, env: Env | Body, structure: dict[str, Any] | None = None
-) -> dict[str, Any]:
-    """Return the description of an artifact, checked to be of the body of `env` and of this structure.
+def check_description(folder: Path, kind: str, env: Env | Body, structure: dict[str, Any]) -> dict[str, Any]:
+    """Return the description of an artifact, if it is of the body of `env` and of this structure.
 
     Raises:
       ArtifactError: there is none, or it is of another body or structure; the message names the first difference.
     """
-    try:
-        description = json.loads((folder / DESCRIPTION).read_text())
-    except (OSError, ValueError):
-        raise ArtifactError(f"{folder}: expected a run that got this far, or its {kind}; got none") from None
-    if not isinstance(description, dict) or not isinstance(description.get("seeds"), int):
+    description = read_description(folder)
+    if description is None:
+        raise ArtifactError(f"{folder}: expected a run that got this far, or its {kind}; got none")
+    if not isinstance(description.get("seeds"), int):
         raise ArtifactError(f"{folder / DESCRIPTION}: expected the description of an artifact, got another file")
     body = {name: value for name, value in describe(env).items() if name != "env"}
-    for name, value in {**body, **(structure or {})}.items():
+    for name, value in {**body, **structure}.items():
         value = list(value) if isinstance(value, tuple) else value
         if description.get(name) != value:
             got, why = description.get(name), f"which {env.name} needs" if name in body else "as in this config"
@@ -95,7 +90,7 @@ def load_options(source: Path, env: Env | Body, config: OptionsConfig, seeds: in
       ArtifactError: nothing is there, or it was made for another body or with another structure.
     """
     folder = source / OPTIONS if (source / OPTIONS).is_dir() else source
-    description = read_description(folder, "option model", env, _structure(config))
+    description = check_description(folder, "option model", env, _structure(config))
     return _load(folder, description["seeds"], seeds, lambda: _empty_model(config, env))
 
 
@@ -130,7 +125,7 @@ def load_policy(source: Path, env: Env, config: PPOConfig, seeds: int) -> tuple[
     """
     folder = source / POLICY
     structure = {"hidden_sizes": list(config.hidden_sizes)}
-    description = read_description(folder, "flat policy", env, structure)
+    description = check_description(folder, "flat policy", env, structure)
     policy, size = Policy(env.action_size, tuple(config.hidden_sizes)), description["observation_size"]
 
     def empty() -> tuple[PolicyParams, normalize.Statistics]:
@@ -157,7 +152,7 @@ def _fit(
 
 def _save(folder: Path, tree: Any, description: dict[str, Any]) -> None:
     save_tree(folder, tree)
-    save_text(folder / DESCRIPTION, json.dumps(description, indent=2) + "\n")
+    save_description(folder, description)
 
 
 def _load(folder: Path, saved: int, seeds: int, empty: Any) -> Any:

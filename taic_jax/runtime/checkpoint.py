@@ -1,32 +1,35 @@
 """Trees of arrays on disk: artifacts of a stage and checkpoints of a run, through Orbax.
 
-A tree is stored flat, one array under each leaf's dotted name. So what is on disk can be compared with what
-is asked for before anything is read, and anyone can read it: Orbax's `load(path)` gives a dict. Checkpoints, which
-are many, hold the bytes of all leaves as one array instead, as Orbax's time is spent per array; their names, dtypes
-and shapes are told in its metadata, and so are checksums, and the version of this package.
+A tree is stored flat, one array under each leaf's dotted name, so that anyone can read it: Orbax's `load(path)` gives a
+dict. Checkpoints, which are many, hold the bytes of all leaves as one array instead, as Orbax's time is spent per
+array. The metadata beside the arrays hold their checksums, the version of this package, and of checkpoints the layout:
+names, dtypes and shapes.
 """
 
 import contextlib
 import logging
+import math
 import os
 import re
 import shutil
+import zlib
 from collections.abc import Callable, Iterator
 from importlib import metadata
 from pathlib import Path
 from typing import Any, TypeVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from orbax.checkpoint import v1 as ocp
 
 from taic_jax.runtime.files import PARTIAL, TEMPORARY, SaveError, make_room, writes_here, writing
-from taic_jax.runtime.flat_tree import Spec, by_name, checksum, from_plain, pack, plain, plain_spec, unpack
 from taic_jax.runtime.hosts import agree
 
 Tree = TypeVar("Tree")
+Spec = tuple[tuple[int, ...], np.dtype]
 
-VERSION, CHECKSUMS, LAYOUT = "taic_jax", "crc32", "layout"  # keys of what is told beside the arrays
+VERSION, CHECKSUMS, LAYOUT = "taic_jax", "crc32", "layout"  # keys of the metadata
 PACKED = "bytes"  # the one array of a checkpoint
 
 # Orbax's threads also log what it raises, in hundreds of lines.
@@ -34,7 +37,7 @@ logging.getLogger("absl").addFilter(lambda record: "orbax" not in Path(record.pa
 
 
 class ArtifactError(ValueError):
-    """Something on disk is not the tree of arrays that was asked for."""
+    """Something on disk is not the tree of arrays that is expected there."""
 
 
 def save_tree(path: Path, tree: Any) -> None:
@@ -46,7 +49,7 @@ def save_tree(path: Path, tree: Any) -> None:
     path = path.absolute()
     partial = path.with_name(path.name + PARTIAL)  # Orbax would remove what is there before it writes
     with _saving(path, partial):
-        _begin(partial, plain(tree), {})()
+        _begin(partial, _plain(tree), {})()
         if writes_here():
             if path.exists():
                 shutil.rmtree(path)
@@ -60,7 +63,7 @@ def load_arrays(path: Path) -> dict[str, np.ndarray]:
     Raises:
         ArtifactError: nothing is there, or something else, or it is damaged.
     """
-    return _read(path, _describe(path)[1])
+    return _read(path)[0]
 
 
 def load_tree(path: Path, like: Tree) -> Tree:
@@ -73,17 +76,16 @@ def load_tree(path: Path, like: Tree) -> Tree:
     Raises:
         ArtifactError: nothing is there, or it is not a tree like this one, or it is damaged.
     """
-    named = by_name(like)
-    stored, told = _describe(path)
-    expected = {name: plain_spec(leaf) for name, leaf in named.items() if leaf.size}
+    arrays, writer = _read(path)
+    named = _by_name(like)
+    expected = {name: _spec(leaf) for name, leaf in named.items() if leaf.size}
+    stored: dict[str, Spec] = {name: (array.shape, array.dtype) for name, array in arrays.items()}
     for name in {**expected, **stored}:
-        want, got = expected.get(name), stored.get(name)
-        if want != got:
-            writer = told.get(VERSION, _version())
+        if expected.get(name) != stored.get(name):
+            want, got = _show(expected.get(name)), _show(stored.get(name))
             by = "" if writer == _version() else f"; taic_jax {writer} wrote it, this is {_version()}"
-            raise ArtifactError(f"{path}: expected {_show(want)} at {name or 'the root'}, got {_show(got)}{by}")
-    arrays = _read(path, told)
-    leaves = [from_plain(arrays.get(name), leaf) for name, leaf in named.items()]
+            raise ArtifactError(f"{path}: expected {want} at {name or 'the root'}, got {got}{by}")
+    leaves = [_restored(arrays.get(name), leaf) for name, leaf in named.items()]
     return jax.tree.unflatten(jax.tree.structure(like), leaves)
 
 
@@ -120,8 +122,9 @@ class Checkpoints:
             SaveError: this step or the one before cannot be written; those that were saved are still there.
         """
         self.wait()
-        path = self.directory / str(step)
-        packed, layout = pack(plain(tree))
+        path, arrays = self.directory / str(step), _plain(tree)
+        layout = [[name, array.dtype.name, list(array.shape)] for name, array in arrays.items()]
+        packed = np.concatenate([_bytes(array) for array in arrays.values()])
         options = ocp.options.ArrayOptions(saving=ocp.options.ArrayOptions.Saving(use_ocdbt=False))  # for many arrays
         with _saving(path, path), ocp.Context(array_options=options):
             self._pending = path, _begin(path, {PACKED: packed}, {LAYOUT: layout})
@@ -144,7 +147,7 @@ class Checkpoints:
         """End the context, however it ends, with nothing being saved any more.
 
         Raises:
-            SaveError: the last step cannot be written; what ends the context is told first.
+            SaveError: the last step cannot be written; a `SaveError` that ends the context goes before it.
         """
         try:
             yield
@@ -152,23 +155,20 @@ class Checkpoints:
             with contextlib.suppress(SaveError):
                 self.wait()
             raise
-        except BaseException:
+        finally:
             self.wait()
-            raise
-        self.wait()
 
     def _drop(self) -> None:
-        if not writes_here():
-            return
-        with writing(self.directory):
-            for old in self.steps()[: -self.keep]:
-                shutil.rmtree(self.directory / str(old))
+        if writes_here():
+            with writing(self.directory):
+                for old in self.steps()[: -self.keep]:
+                    shutil.rmtree(self.directory / str(old))
 
     def load(self, step: int, like: Tree) -> Tree:
         """Load the tree of this step.
 
         Raises:
-            ArtifactError: see `load_tree`; the message tells what is left without this step.
+            ArtifactError: see `load_tree`; the message says what is left without this step.
         """
         path = self.directory / str(step)
         try:
@@ -179,19 +179,18 @@ class Checkpoints:
             raise ArtifactError(f"{error}; without {path} --resume goes on {left}") from None
 
 
-def _begin(path: Path, arrays: dict[str, np.ndarray], told: dict[str, Any]) -> Callable[[], None]:
-    """Begin to write arrays to the folder `path`, with what else is told of them; return what waits for the end."""
+def _begin(path: Path, arrays: dict[str, np.ndarray], extra: dict[str, Any]) -> Callable[[], None]:
+    """Begin to write arrays to the folder `path`, with `extra` metadata; return a function that waits for the end."""
     path.parent.mkdir(parents=True, exist_ok=True)
     if writes_here():
         make_room(path.parent, sum(array.nbytes for array in arrays.values()) + len(arrays) * 2**10 + 2**14)
-    sums = {name: checksum(array) for name, array in arrays.items()}
-    told = {VERSION: _version(), CHECKSUMS: sums, **told}
-    return ocp.save_async(str(path), arrays, overwrite=True, custom_metadata=told).result
+    beside = {VERSION: _version(), CHECKSUMS: _checksums(arrays), **extra}
+    return ocp.save_async(str(path), arrays, overwrite=True, custom_metadata=beside).result
 
 
 @contextlib.contextmanager
 def _saving(path: Path, written: Path) -> Iterator[None]:
-    """Tell in one line why `path` cannot be saved, and remove what there is by then of the folder that is written."""
+    """Say in one line why `path` cannot be saved, and remove what there is by then of the folder that is written."""
     try:
         with writing(path):
             yield
@@ -203,36 +202,70 @@ def _saving(path: Path, written: Path) -> Iterator[None]:
         raise SaveError(f"{path}: cannot be written: {os.strerror(int(code[1]))}") from error
 
 
-def _describe(path: Path) -> tuple[dict[str, Spec], dict[str, Any]]:
-    """Return the shapes and dtypes of the arrays in a folder by dotted name, and what else is told of them."""
+def _read(path: Path) -> tuple[dict[str, np.ndarray], str]:
+    """Return the arrays in a folder by dotted name, and the version of this package that wrote them."""
     if not path.exists():
         raise ArtifactError(f"{path}: expected an artifact, got nothing")
-    with _errors_in_one_line(path):
-        found = ocp.metadata(str(path.absolute()))
-        told: Any = found.custom_metadata or {}
-        if LAYOUT in told:
-            return {name: (tuple(shape), np.dtype(dtype)) for name, dtype, shape in told[LAYOUT]}, told
-        return {name: (meta.shape, meta.dtype) for name, meta in found.metadata.items()}, told
-
-
-def _read(path: Path, told: dict[str, Any]) -> dict[str, np.ndarray]:
-    """Return the arrays in a folder by dotted name, given what is told of them."""
-    with _errors_in_one_line(path):
-        specs = ocp.metadata(str(path.absolute())).metadata
-        empty = {name: np.empty(meta.shape, meta.dtype) for name, meta in specs.items()}
-        arrays = ocp.load(str(path.absolute()), empty)
-        sums = {name: checksum(array) for name, array in arrays.items()}
-        if sums != told.get(CHECKSUMS, sums):  # earlier versions told none
-            raise ValueError
-        return unpack(arrays[PACKED], told[LAYOUT]) if LAYOUT in told else arrays
-
-
-@contextlib.contextmanager
-def _errors_in_one_line(path: Path) -> Iterator[None]:
     try:
-        yield
+        stored = ocp.metadata(str(path.absolute()))
+        beside: Any = stored.custom_metadata or {}
+        empty = {name: np.empty(meta.shape, meta.dtype) for name, meta in stored.metadata.items()}
+        arrays = ocp.load(str(path.absolute()), empty)
+        sums = _checksums(arrays)
+        if beside.get(CHECKSUMS, sums) != sums:  # earlier versions wrote none
+            raise ValueError
+        arrays = _unpacked(arrays[PACKED], beside[LAYOUT]) if LAYOUT in beside else arrays
     except (ValueError, OSError, AttributeError, KeyError, TypeError):
         raise ArtifactError(f"{path}: expected an artifact, got files of another kind or damaged ones") from None
+    return arrays, beside.get(VERSION, _version())
+
+
+def _unpacked(packed: np.ndarray, layout: list) -> dict[str, np.ndarray]:
+    arrays, begin = {}, 0
+    for name, dtype, shape in layout:
+        end = begin + math.prod(shape) * np.dtype(dtype).itemsize
+        arrays[name] = packed[begin:end].copy().view(dtype).reshape(shape)  # copied, to begin at an even address
+        begin = end
+    return arrays
+
+
+def _by_name(tree: Any) -> dict[str, Any]:
+    """Return the leaves by dotted name, in the tree's order."""
+    return {jax.tree_util.keystr(p, simple=True, separator="."): leaf for p, leaf in jax.tree.leaves_with_path(tree)}
+
+
+def _plain(tree: Any) -> dict[str, np.ndarray]:
+    """Return the leaves by dotted name as NumPy's arrays, without those that have no entries: Orbax has none."""
+    named = {name: leaf for name, leaf in _by_name(tree).items() if leaf.size}
+    return jax.device_get({name: jax.random.key_data(x) if _is_key(x) else x for name, x in named.items()})
+
+
+def _spec(leaf: Any) -> Spec:
+    """Return the shape and dtype of a leaf as `_plain` gives it."""
+    plain = jax.eval_shape(jax.random.key_data, leaf) if _is_key(leaf) else leaf
+    return plain.shape, plain.dtype
+
+
+def _restored(array: np.ndarray | None, leaf: Any) -> jax.Array:
+    """Undo `_plain` for one leaf, from one like it; onto its devices."""
+    if array is None:  # it has no entries
+        return jnp.zeros(leaf.shape, leaf.dtype)
+    if _is_key(leaf):
+        kind = jax.random.key_impl(jnp.zeros((), leaf.dtype))  # an abstract leaf has no implementation to ask
+        array = jax.random.wrap_key_data(jnp.asarray(array), impl=kind)
+    return jax.device_put(array, leaf.sharding if getattr(leaf, "committed", False) else None)
+
+
+def _is_key(leaf: Any) -> bool:
+    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def _bytes(array: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(array).reshape(-1).view(np.uint8)
+
+
+def _checksums(arrays: dict[str, np.ndarray]) -> dict[str, int]:
+    return {name: zlib.crc32(_bytes(array).data) for name, array in arrays.items()}
 
 
 def _version() -> str:

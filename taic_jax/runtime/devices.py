@@ -61,7 +61,7 @@ class Devices:
         return jax.tree.map(lambda x: x if len(x) == count else x[:count], rows)
 
     def compile(self, function: Callable, *args: Any, donate: bool = False) -> Callable:
-        """Compile a function of rows and to rows for arguments that were placed; the first may be given away."""
+        """Compile a function of rows and to rows for arguments that were placed; the first may be donated."""
         settings: dict[str, Any] = {"donate_argnums": 0 if donate else ()}
         if self.shard == "none":
             return jax.jit(function, **settings).lower(*args).compile(compiler_options=compiler_options())
@@ -91,14 +91,14 @@ def _same(rows: Tree) -> Tree:
 def open_devices(shard: Shard, rows: int, hosts: Hosts = ALONE) -> Shard:
     """Have JAX take each physical core of a CPU for a device, or fewer where rows want no more; return what to split.
 
-    To be called before anything is computed. A number of devices that JAX was told is kept. Over several hosts, wait
-    for the others.
+    To be called before anything is computed. A number of devices that JAX's own settings name stays. Over several
+    hosts, wait for the others.
 
     Raises:
       ConfigError: the other hosts cannot be reached.
     """
-    told = "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
-    if shard != "none" and not told and jax.config.values["jax_num_cpu_devices"] < 1:
+    is_set = "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
+    if shard != "none" and not is_set and jax.config.values["jax_num_cpu_devices"] < 1:
         cores = num_physical_cores()
         jax.config.update("jax_num_cpu_devices", cores if shard == ENVS else fewest(-(-rows // hosts.count), cores))
     if hosts.count > 1:

@@ -1,9 +1,11 @@
 """What every stage of the main job is driven by: compile once, step, log, checkpoint, resume."""
 
+import contextlib
 import json
 import sys
+import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -17,38 +19,43 @@ from taic_jax.config import Config
 from taic_jax.nonfinite import FINITE, QUANTITIES, Guarded, begin, guarded
 from taic_jax.runtime.checkpoint import ArtifactError, Checkpoints, save_tree
 from taic_jax.runtime.devices import Devices
-from taic_jax.runtime.files import save_text
+from taic_jax.runtime.files import save_description, save_json, writes_here
 from taic_jax.runtime.hosts import agree
 from taic_jax.runtime.logging import RunLogger
 from taic_jax.runtime.pbt import Members, Population
+from taic_jax.runtime.run_folder import RunFolder
 from taic_jax.runtime.signals import DivergedError, Interrupted, Signals
+from taic_jax.types import as_rows
 
 S = TypeVar("S")
 
-STAGES = ("collect", "learn", "train", "flat", "evaluate", "video", "repeat", "total", "transfer")
+STAGE_STREAMS = {
+    "collect": 0, "learn": 1, "train": 2, "flat": 3, "evaluate": 4, "video": 5, "repeat": 6, "total": 7, "transfer": 8,
+}  # fmt: skip
+"""The stream of random numbers that each stage draws from. A number is never reused: old runs drew from it."""
 BUILDS_ON = {"learn": ("collect",), "train": ("collect", "learn")}
 """What a stage starts from: a seed that stopped there stays stopped."""
 CHECKPOINT_SECONDS = 30.0
-CLOCK, DUMPS = "clock.json", "dumps"
+DUMPS = "dumps"
 
 
 @dataclass
 class Clock:
-    """Seconds spent compiling and running, and the ticks run in that time, which checkpoints tell on a resume."""
+    """Seconds spent compiling and running, and the ticks run in that time, which a resume reads off checkpoints."""
 
     compile: float = 0.0
     run: float = 0.0
     ticks: int = 0
 
     def add(self, since: float, path: Path) -> float:
-        """Count what ran since then, write to a JSON file, so that a resumed run counts on, and return the time."""
+        """Count what ran since then, write the seconds so that a resumed run counts on, and return the time."""
         self.run += time.perf_counter() - since
-        save_text(path, json.dumps({"compile": self.compile, "run": self.run}) + "\n")
+        save_json(path, {"compile": self.compile, "run": self.run})
         return time.perf_counter()
 
     @classmethod
     def load(cls, path: Path) -> "Clock":
-        """Read what `save` wrote; without a file, start at zero.
+        """Read what `add` wrote; without a file, start at zero.
 
         Raises:
           ArtifactError: it is not such a file.
@@ -74,18 +81,60 @@ class Run:
 
     config: Config
     keys: jax.Array
-    dir: Path
+    folder: RunFolder
     logger: RunLogger
-    clock: Clock
+    clock: Clock = field(default_factory=Clock)
     signals: Signals = field(default_factory=Signals)
     checkpoint_seconds: float = field(default_factory=lambda: CHECKPOINT_SECONDS)
     stopped: dict[str, Stopped] = field(default_factory=dict)
     devices: Devices = Devices()
     population: Population | None = None
 
+    @classmethod
+    @contextlib.contextmanager
+    def open(
+        cls,
+        config: Config,
+        path: Path,
+        *,
+        points: Sequence[Config] = (),
+        resume: bool = False,
+        overwrite: bool = False,
+        quiet: bool = False,
+        **settings: Any,
+    ) -> Iterator["Run"]:
+        """Begin a run in the folder `path`, or resume the one in it; nobody else writes there while in the context.
+
+        Args as `pipeline.run_pipeline`; `settings` are the `devices`, `signals`, `checkpoint_seconds` and `population`.
+
+        Raises:
+          RunFolderError: the folder holds another run, or none to resume, or another process is at it.
+          ArtifactError: its clock is damaged.
+        """
+        folder, points = RunFolder(path), points or (config,)
+        folder.prepare(config, resume=resume, overwrite=overwrite)
+        logs = contextlib.nullcontext(path) if writes_here() else tempfile.TemporaryDirectory()
+        with folder.claimed(), logs as logs, RunLogger(Path(logs), quiet=quiet) as logger:
+            clock = Clock.load(folder.clock_path)
+            logger.truncate("evaluate", -1)
+            rows, keys = as_rows(points, config.seeds), _keys(config, len(points))
+            yield cls(rows, keys, folder, logger, clock, **settings)
+
+    @classmethod
+    @contextlib.contextmanager
+    def view(cls, config: Config, path: Path, point: Config) -> Iterator["Run"]:
+        """Give one point of the run in the folder `path`, a config of arrays, and neither claim nor write anything."""
+        with tempfile.TemporaryDirectory() as logs, RunLogger(Path(logs), quiet=True) as logger:
+            yield cls(as_rows([point], config.seeds), _keys(config), RunFolder(path), logger)
+
+    @property
+    def dir(self) -> Path:
+        """The folder's path."""
+        return self.folder.path
+
     def stage_keys(self, stage: str) -> jax.Array:
         """Return the seeds' keys [K] of one stage; a seed's key does not depend on the number of seeds."""
-        return jax.vmap(partial(jax.random.fold_in, data=STAGES.index(stage)))(self.keys)
+        return jax.vmap(partial(jax.random.fold_in, data=STAGE_STREAMS[stage]))(self.keys)
 
     def rows(self, tree: S) -> S:
         """Return the rows of the run's own seeds and points, of those that the devices had."""
@@ -97,32 +146,38 @@ class Run:
         codes += [jnp.asarray(self.stopped[name].code) for name in BUILDS_ON.get(stage, ()) if name in self.stopped]
         return jnp.stack(codes).max(axis=0)
 
-    def record_divergence(self, stage: str, guard: Guarded, unit: int, known: np.ndarray | None = None) -> np.ndarray:
-        """Note which seeds have stopped, dump and tell those that `known` does not have yet, and return the codes [K].
+    def record_divergence(self, stage: str, guard: Guarded, unit: int, before: np.ndarray | None = None) -> np.ndarray:
+        """Note which seeds have stopped, dump and report those whose codes were others `before`, and return all [K].
 
         Raises:
           DivergedError: none goes on.
         """
         codes, steps = jax.device_get((guard.code, guard.step))
         self.stopped[stage] = Stopped(codes, steps * unit)
-        for seed in np.flatnonzero(codes != known) if known is not None else ():
-            folder = self.dir / DUMPS / f"{stage}-{steps[seed] * unit}-seed{seed}"
-            told = {"stage": stage, "seed": int(seed), "seeds": len(codes), "step": int(steps[seed])}
-            told |= {"after": int(steps[seed] * unit), "quantity": QUANTITIES[codes[seed]]}
-            evolved = isinstance(guard.state, Members)
-            state, config = (guard.state.state, guard.state.config) if evolved else (guard.state, self.config)
-            for name, rows in {"state": state, "config": config}.items():
-                save_tree(folder / name, jax.tree.map(lambda x, k=seed: x[k], rows))
-            save_text(folder / "description.json", json.dumps(told, indent=2) + "\n")
-            print(
-                f"taic_jax: seed {seed} stopped in {stage} after {told['after']:,}: its {told['quantity']} is not "
-                f"finite; --replay {folder} shows it again",
-                file=sys.stderr,
-            )
+        for seed in np.flatnonzero(codes != before) if before is not None else ():
+            self._dump(stage, guard, unit, int(seed))
         if (codes != FINITE).all():
             where = self.dir / DUMPS
             raise DivergedError(f"{stage}: every seed has stopped, at numbers that are not finite: see {where}")
         return codes
+
+    def _dump(self, stage: str, guard: Guarded, unit: int, seed: int) -> None:
+        """Save the last good state of a seed for `--replay`, and say that it has stopped."""
+        code, step = (int(x[seed]) for x in jax.device_get((guard.code, guard.step)))
+        quantity = QUANTITIES[code]
+        description = {"stage": stage, "seed": seed, "seeds": len(self.keys), "step": step}
+        description |= {"after": step * unit, "quantity": quantity}
+        folder = self.dir / DUMPS / f"{stage}-{step * unit}-seed{seed}"
+        evolved = isinstance(guard.state, Members)
+        state, config = (guard.state.state, guard.state.config) if evolved else (guard.state, self.config)
+        for name, rows in {"state": state, "config": config}.items():
+            save_tree(folder / name, jax.tree.map(lambda x: x[seed], rows))
+        save_description(folder, description)
+        print(
+            f"taic_jax: seed {seed} stopped in {stage} after {step * unit:,}: its {quantity} is not finite; "
+            f"--replay {folder} shows it again",
+            file=sys.stderr,
+        )
 
     def compile(self, stage: str, function: Callable, *args: Any, donate: bool = False) -> Callable:
         """Compile ahead of time for placed rows; a call of other shapes or types fails instead of compiling again."""
@@ -133,8 +188,13 @@ class Run:
         return compiled
 
 
+def _keys(config: Config, points: int = 1) -> jax.Array:
+    """Return the keys of the rows: seed k of a run is seed 0 of a run whose seed is k more."""
+    return jnp.stack([jax.random.key(config.seed + k) for _ in range(points) for k in range(config.seeds)])
+
+
 def resume(checkpoints: Checkpoints, guard: Guarded) -> tuple[Guarded, int]:
-    """Return the last checkpoint that every host sees, and its step; without one, what is given, and 0.
+    """Return the last checkpoint that every host sees, and its step; without one, `guard` and 0.
 
     Types are never weak, as a checkpoint's are not: the program compiled at the start is the one that resumes.
     """
@@ -161,9 +221,9 @@ def drive(
     A seed whose numbers are not finite stops at its last good state, which is also dumped; the others go on.
 
     Args:
-      run: the run; its `stopped` is told of the seeds that did not get through.
+      run: the run; its `stopped` notes the seeds that did not get through.
       stage: its name.
-      step: (states [K], *args) -> (states, metrics [K] with the codes `nonfinite`, what `after` is told).
+      step: (states [K], *args) -> (states, metrics [K] with the codes `nonfinite`, what `after` takes).
       state: before the first step; consumed.
       *args: arrays that stay the same.
       num_steps: in all.
@@ -180,7 +240,7 @@ def drive(
     guard, first = resume(checkpoints, begin(state, run.inherited(stage)))
     run.clock.ticks += first * ticks
     run.logger.truncate(stage, first * unit)
-    known = run.record_divergence(stage, guard, unit)
+    codes = run.record_divergence(stage, guard, unit)
     if first == num_steps:
         return guard.state
     guard, args = run.devices.place((guard, args))
@@ -189,18 +249,18 @@ def drive(
     with checkpoints.waited_for(), run.logger.stage(stage, num_steps * unit, done=first * unit):
         for index in range(first, num_steps):
             guard, metrics, extra = compiled(guard, *args)
-            metrics, codes = jax.device_get(run.rows((metrics, guard.code)))
+            metrics, new_codes = jax.device_get(run.rows((metrics, guard.code)))
             run.logger.log(stage, (index + 1) * unit, metrics, "ticks" if ticks else "steps")
             if after is not None:
                 after(index, run.rows(extra))
             run.clock.ticks += ticks
-            if changed := bool((codes != known).any()):
-                known = run.record_divergence(stage, run.rows(guard), unit, known)
+            if changed := bool((new_codes != codes).any()):
+                codes = run.record_divergence(stage, run.rows(guard), unit, before=codes)
             due = changed or index + 1 == num_steps or time.perf_counter() - saved > run.checkpoint_seconds
             due, received = agree([due, run.signals.received or 0])
             if due or received:
                 checkpoints.save(index + 1, run.rows(guard))
-                saved = run.clock.add(saved, run.dir / CLOCK)
+                saved = run.clock.add(saved, run.folder.clock_path)
             if received:
                 raise Interrupted(received)
     agree([0])  # no host reads what `after` writes before it is there

@@ -1,4 +1,4 @@
-"""Files that appear under their name when they are whole, and not before, and what is told where that fails."""
+"""Files that appear under their name when they are whole, and not before, and one line of error where that fails."""
 
 import contextlib
 import csv
@@ -13,6 +13,8 @@ from typing import Any, BinaryIO
 
 PARTIAL = ".partial"
 """Ending of a file that is not whole yet."""
+DESCRIPTION = "description.json"
+"""File beside arrays that says what they are."""
 TEMPORARY = ".orbax-checkpoint-tmp"  # Orbax writes a folder under this suffix, and renames when all is written
 
 
@@ -22,7 +24,7 @@ class SaveError(OSError):
 
 @contextlib.contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Tell in one line what keeps `path` from being written.
+    """Say in one line what keeps `path` from being written.
 
     Raises:
         SaveError: something does.
@@ -61,7 +63,7 @@ def whole_file(path: Path) -> Iterator[BinaryIO]:
                 yield file
             os.replace(partial, path)
         except BaseException:
-            with contextlib.suppress(OSError):  # what went wrong first is what is told
+            with contextlib.suppress(OSError):  # the first error is the one to report
                 partial.unlink(missing_ok=True)
             raise
 
@@ -84,6 +86,24 @@ def save_json(path: Path, tree: Any) -> None:
         ValueError: a number is not finite (see `json_safe`).
     """
     save_text(path, json.dumps(tree, indent=2, allow_nan=False) + "\n")
+
+
+def save_description(folder: Path, description: Mapping[str, Any]) -> None:
+    """Write what the arrays in a folder are.
+
+    Raises:
+        SaveError: it cannot be written.
+    """
+    save_json(folder / DESCRIPTION, description)
+
+
+def read_description(folder: Path) -> dict[str, Any] | None:
+    """Read what `save_description` wrote: None without a JSON file there, and {} where it holds something else."""
+    try:
+        description = json.loads((folder / DESCRIPTION).read_text())
+    except (OSError, ValueError):
+        return None
+    return description if isinstance(description, dict) else {}
 
 
 def save_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:

@@ -1,7 +1,7 @@
 """One run over several hosts, each of which runs this program.
 
-All go through the same iterations and hold the same results, which the first writes to a folder that all see. What one
-learns alone, as that it shall stop, it tells the others.
+All go through the same iterations and hold the same results, which the first writes to a folder that all see. News of
+one host, such as a signal to stop, goes to all by `agree`.
 """
 
 import signal
@@ -21,7 +21,7 @@ from taic_jax.config import ConfigError
 PATIENCE = 20.0
 """Seconds in which the first host must answer the others."""
 FOREVER = 10**6
-"""Seconds that JAX waits for the last host; it would end with a stack of C++ instead of an error."""
+"""Seconds that JAX waits for the last host; at their end it would print a stack of C++ instead of an error."""
 
 
 class Hosts(NamedTuple):
@@ -45,7 +45,7 @@ def join(hosts: Hosts) -> None:
         _await_answer(hosts.coordinator)
     else:
         print(f"taic_jax: waiting for {hosts.count - 1} more hosts at {hosts.coordinator}", file=sys.stderr)
-    before = signal.signal(signal.SIGINT, signal.SIG_DFL)  # JAX would not hear of Python's
+    before = signal.signal(signal.SIGINT, signal.SIG_DFL)  # Python's would wait until JAX returns
     try:
         jax.distributed.initialize(hosts.coordinator, hosts.count, hosts.index, initialization_timeout=FOREVER)
     except RuntimeError as error:
@@ -64,8 +64,8 @@ def _await_answer(address: str) -> None:
             return
         except OSError as error:
             if time.monotonic() > until:
-                told = f"{address} has not answered for {PATIENCE:.0f} s ({error.strerror or error})"
-                raise ConfigError(f"--coordinator: {told}; host 0 is to be started there") from None
+                reason = f"has not answered for {PATIENCE:.0f} s ({error.strerror or error})"
+                raise ConfigError(f"--coordinator: {address} {reason}; host 0 is to be started there") from None
         time.sleep(0.2)
 
 

@@ -6,7 +6,6 @@ are dropped from the one, and the other is drawn again.
 
 import contextlib
 import json
-import math
 import shutil
 import time
 from collections.abc import Iterator, Mapping
@@ -18,10 +17,10 @@ from tensorboardX.proto.event_pb2 import Event  # pyright: ignore[reportAttribut
 from tensorboardX.record_writer import RecordWriter
 from tensorboardX.summary import histogram_raw, scalar
 
-from taic_jax.runtime.files import save_text, writing
-from taic_jax.runtime.progress import Work, make_display
+from taic_jax.runtime.files import json_safe, save_text, writing
+from taic_jax.runtime.progress import Display, Work
+from taic_jax.runtime.run_folder import Row, RunFolder
 
-Row = dict[str, Any]
 Unit = Literal["ticks", "steps"]
 
 
@@ -38,13 +37,14 @@ class RunLogger:
     """
 
     def __init__(self, run_dir: Path, *, quiet: bool = False):
-        self._path, self._events_dir = run_dir / "metrics.jsonl", run_dir / "tensorboard"
+        self._folder, self._events_dir = RunFolder(run_dir), run_dir / "tensorboard"
+        self._path = self._folder.metrics_path
         with writing(run_dir):
             self._events_dir.mkdir(parents=True, exist_ok=True)
         with writing(self._path):
             _drop_half_row(self._path)
         self._open()
-        self._display, self._stage = make_display(quiet), None
+        self._display, self._stage = Display(quiet), None
 
     def __enter__(self) -> "RunLogger":
         self._display.start()
@@ -58,7 +58,7 @@ class RunLogger:
     def stage(self, name: str, total: int, done: int = 0) -> Iterator[None]:
         """Show the progress of a stage of `total` ticks or steps, of which `done` were made before a resume."""
         self._stage = Work(name, total, done, done)
-        with self._shown(self._stage):
+        with self._display.showing(self._stage):
             yield
         self._stage = None
 
@@ -68,7 +68,7 @@ class RunLogger:
 
     def doing(self, text: str) -> contextlib.AbstractContextManager[None]:
         """Show in the context that a run is at something that has no measure, as in `train: compiling`."""
-        return self._shown(Work(text))
+        return self._display.showing(Work(text))
 
     def log(self, stage: str, count: int, metrics: Mapping[str, Any], unit: Unit = "ticks") -> None:
         """Write one row.
@@ -83,27 +83,29 @@ class RunLogger:
             SaveError: the row cannot be written.
         """
         row: Row = {"stage": stage, unit: count, "time": round(time.time(), 3)}
-        row |= {f"{stage}/{name}": _to_json(value) for name, value in metrics.items()}
+        row |= json_safe({f"{stage}/{name}": value for name, value in metrics.items()})
         with writing(self._path):
             self._file.write(json.dumps(row, allow_nan=False) + "\n")
             self._file.flush()
         self._write_events(row)
         with writing(self._events_dir):
             self._events.flush()
-        if self._stage is not None:
-            self._advance(self._stage, row, unit)
+        if work := self._stage:
+            work.done, work.unit, work.result = count, unit, _mean(row.get(f"{stage}/return"))
+            work.seeds = max(len(value) if isinstance(value, list) else 1 for value in row.values())
+            self._display.update(work)
 
     def truncate(self, stage: str, count: int) -> None:
         """Drop the rows of a stage after `count`, which a resumed run will write again; -1 drops them all."""
-        rows = read_metrics(self._path)
-        kept = [row for row in rows if row["stage"] != stage or _count(row) <= count]
-        if len(kept) == len(rows):
+        rows = self._folder.metrics()
+        remaining = [row for row in rows if row["stage"] != stage or _count(row) <= count]
+        if len(remaining) == len(rows):
             return
         self._close()
         shutil.rmtree(self._events_dir, ignore_errors=True)
-        save_text(self._path, "".join(json.dumps(row) + "\n" for row in kept))
+        save_text(self._path, "".join(json.dumps(row) + "\n" for row in remaining))
         self._open()
-        for row in kept:
+        for row in remaining:
             self._write_events(row)
 
     def _open(self) -> None:
@@ -127,41 +129,24 @@ class RunLogger:
     def _write_events(self, row: Row) -> None:
         for name, value in row.items():
             if isinstance(value, list) and value and isinstance(value[0], list):
-                self._write_histogram(name, np.nansum(np.array(value, float), axis=0), row)
+                summary = _histogram(name, np.nansum(np.array(value, float), axis=0))
             elif "/" in name and (mean := _mean(value)) is not None:
-                self._write_event(scalar(name, mean), row)
-
-    def _write_histogram(self, name: str, counts: np.ndarray, row: Row) -> None:
-        """Write how often each of 1..L occurred."""
-        values = np.arange(1, len(counts) + 1)
-        total, squares = float(counts @ values), float(counts @ values**2)
-        summary = histogram_raw(
-            name, min=0.5, max=len(counts) + 0.5, num=int(counts.sum()), sum=total, sum_squares=squares,
-            bucket_limits=(values + 0.5).tolist(), bucket_counts=counts.tolist(),
-        )  # fmt: skip
-        self._write_event(summary, row)
-
-    def _write_event(self, summary: Any, row: Row) -> None:
-        with writing(self._events_dir):
-            self._events.write(Event(wall_time=row["time"], step=_count(row), summary=summary).SerializeToString())
-
-    def _advance(self, stage: Work, row: Row, unit: Unit) -> None:
-        stage.done, stage.unit, stage.result = row[unit], unit, _mean(row.get(f"{row['stage']}/return"))
-        stage.seeds = max(len(value) if isinstance(value, list) else 1 for value in row.values())
-        self._display.show(stage)
-
-    @contextlib.contextmanager
-    def _shown(self, work: Work) -> Iterator[None]:
-        self._display.show(work)
-        try:
-            yield
-        finally:
-            self._display.show(None)
+                summary = scalar(name, mean)
+            else:
+                continue
+            event = Event(wall_time=row["time"], step=_count(row), summary=summary)
+            with writing(self._events_dir):
+                self._events.write(event.SerializeToString())
 
 
-def read_metrics(path: Path) -> list[Row]:
-    """Read the rows of a metrics.jsonl; a half-written last one is left out."""
-    return [json.loads(line) for line in path.read_text().splitlines(keepends=True) if line.endswith("\n")]
+def _histogram(name: str, counts: np.ndarray) -> Any:
+    """Return the event of how often each of 1..L occurred."""
+    values = np.arange(1, len(counts) + 1)
+    total, squares = float(counts @ values), float(counts @ values**2)
+    return histogram_raw(
+        name, min=0.5, max=len(counts) + 0.5, num=int(counts.sum()), sum=total, sum_squares=squares,
+        bucket_limits=(values + 0.5).tolist(), bucket_counts=counts.tolist(),
+    )  # fmt: skip
 
 
 def _count(row: Row) -> int:
@@ -173,15 +158,6 @@ def _drop_half_row(path: Path) -> None:
     if path.exists():
         with path.open("rb+") as file:
             file.truncate(file.read().rfind(b"\n") + 1)
-
-
-def _to_json(value: Any) -> Any:
-    """Turn a number or an array [K] into numbers that JSON knows; what is not finite becomes None."""
-    numbers = np.asarray(value)
-    if numbers.ndim:
-        return [_to_json(number) for number in numbers]
-    number = numbers.astype(np.float64).item() if numbers.dtype.kind not in "iu" else numbers.item()
-    return number if math.isfinite(number) else None
 
 
 def _mean(value: Any) -> float | None:

@@ -6,7 +6,9 @@ numbers perturbed. Each seed has a population of its own, so that seeds stay ind
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from operator import attrgetter
+from functools import partial
+from itertools import groupby
+from operator import attrgetter, itemgetter
 from typing import Any
 
 import jax
@@ -34,7 +36,7 @@ class Members(struct.PyTreeNode):
 
 @dataclass(frozen=True)
 class Population:
-    """How G points evolve: `bounds` are of each number that is perturbed, by its dotted name in the config."""
+    """How points evolve: `bounds` are of each number that is perturbed, by its dotted name in the config."""
 
     every: int
     bounds: dict[str, tuple[float, float]]
@@ -54,13 +56,13 @@ class Population:
         def call(members: Members, trainer: Any) -> tuple[Members, dict, Any]:
             state, metrics, extra = step(members.state, trainer.replace(config=members.config))
             count = members.count + 1
-            key, key_donor, key_factor = _split(members.key)
+            key, key_donor, key_factor = jax.vmap(partial(jax.random.split, num=3), out_axes=1)(members.key)
             score = jnp.where(metrics["nonfinite"] == FINITE, metrics["return"], jnp.nan)
             parent = _parents(score.reshape(-1, self.seeds), key_donor)
             parent = jnp.where(count % self.every == 0, parent, jnp.arange(len(parent)))
-            told = {f"{PREFIX}/{name}": attrgetter(name)(members.config) for name in self.bounds}
+            numbers = {f"{PREFIX}/{name}": attrgetter(name)(members.config) for name in self.bounds}
             after = Members(_take_over(state, parent), self._explore(members.config, parent, key_factor), key, count)
-            return after, metrics | told | {PARENT: parent.astype(jnp.float32)}, extra
+            return after, metrics | numbers | {PARENT: parent.astype(jnp.float32)}, extra
 
         return call
 
@@ -75,21 +77,16 @@ class Population:
         return config
 
 
-def _split(key: Key[Array, " R"]) -> tuple[Array, Array, Array]:
-    keys = jax.vmap(lambda k: jax.random.split(k, 3))(key)
-    return keys[:, 0], keys[:, 1], keys[:, 2]
-
-
 def _parents(score: Float[Array, "G K"], key: Key[Array, " R"]) -> Int[Array, " R"]:
     """Return for each row whose weights it goes on with: its own, or those of a better one of the same seed."""
     points, seeds = score.shape
     few = max(points // SHARE, 1)
-    known = jnp.where(jnp.isnan(score), -jnp.inf, score)
-    order = jnp.argsort(-known, axis=0)
+    score = jnp.where(jnp.isnan(score), -jnp.inf, score)
+    order = jnp.argsort(-score, axis=0)
     rank = jnp.argsort(order, axis=0)
     seed = jnp.broadcast_to(jnp.arange(seeds), score.shape)
     donor = order[jax.vmap(lambda k: jax.random.randint(k, (), 0, few))(key).reshape(score.shape), seed]
-    worse: Bool[Array, "G K"] = (rank >= points - few) & (known < known[donor, seed])
+    worse: Bool[Array, "G K"] = (rank >= points - few) & (score < score[donor, seed])
     point = jnp.broadcast_to(jnp.arange(points)[:, None], score.shape)
     return (jnp.where(worse, donor, point) * seeds + seed).reshape(-1)
 
@@ -107,10 +104,9 @@ def schedule(rows: list[dict[str, Any]], names: list[str], row: int) -> list[tup
       names: of the numbers, dotted.
       row: of the last one.
     """
-    found: list[tuple[int, dict[str, float]]] = []
+    steps: list[tuple[int, dict[str, float]]] = []
     for i in reversed(range(len(rows))):
         row = int(rows[i][f"train/{PARENT}"][row])
         since = rows[i - 1]["ticks"] if i else 0
-        found.append((since, {name: rows[i][f"train/{PREFIX}/{name}"][row] for name in names}))
-    found.reverse()
-    return [entry for i, entry in enumerate(found) if not i or entry[1] != found[i - 1][1]]
+        steps.append((since, {name: rows[i][f"train/{PREFIX}/{name}"][row] for name in names}))
+    return [next(same) for _, same in groupby(reversed(steps), key=itemgetter(1))]

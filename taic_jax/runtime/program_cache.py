@@ -1,4 +1,4 @@
-"""Compiled programs are kept on disk, so that a run like an earlier one starts in seconds."""
+"""The cache of compiled programs on disk, by which a run like an earlier one starts in seconds."""
 
 import contextlib
 from functools import cache
@@ -13,10 +13,10 @@ WITHOUT_YNNPACK: dict[str, str | bool] = {"xla_cpu_experimental_ynn_fusion_type"
 
 
 def keep_programs() -> None:
-    """Keep compiled programs in the user's cache folder, at most 1 GiB of them, unless JAX was told a folder."""
+    """Keep compiled programs in the user's cache folder, at most 1 GiB of them, unless a setting of JAX names one."""
     if jax.config.values["jax_compilation_cache_dir"] is None:
         folder = platformdirs.user_cache_path("taic_jax") / "programs"
-        with contextlib.suppress(OSError):  # JAX tells what is the matter with the folder
+        with contextlib.suppress(OSError):  # JAX warns of such a folder itself
             _remove_half_written(folder)
         jax.config.update("jax_compilation_cache_dir", str(folder))
         jax.config.update("jax_compilation_cache_max_size", MAX_BYTES)

@@ -1,8 +1,9 @@
 """What a run is doing, on standard error: a bar on a terminal, a line every 10 seconds in a log file."""
 
-import sys
+import contextlib
 import threading
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 from rich.console import Console
@@ -58,111 +59,76 @@ class Work:
 
 
 class Display:
-    """Shows nothing; those below show it somewhere."""
+    """Show on a terminal a bar for each stage, redrawn in place, and one below that moves while something else is done.
 
-    def start(self) -> None:
-        """Begin to show."""
+    In a file, write a line where work without a measure first begins, every `INTERVAL` seconds, and at the end of each
+    stage. Where `quiet`, show nothing.
+    """
 
-    def show(self, work: Work | None) -> None:
-        """Show this work from now on, or how far it has come; None is a pause between two."""
-
-    def say(self, text: str) -> None:
-        """Write a line that stays."""
-
-    def stop(self) -> None:
-        """Show nothing more."""
-
-
-class Bar(Display):
-    """A bar for each stage, redrawn in place, and below it one that moves while something else is done."""
-
-    def __init__(self, console: Console):
+    def __init__(self, quiet: bool):
+        self._console = Console(stderr=True, quiet=quiet)
         self._progress = Progress(
             TextColumn("{task.description:>20}"),
             BarColumn(bar_width=24),
             TextColumn("{task.fields[text]}"),
             TimeRemainingColumn(),
-            console=console,
+            console=self._console,
+            disable=quiet or not self._console.is_terminal,
         )
+        self._task: TaskID
         self._work: Work | None = None
-        self._task: TaskID | None = None
-
-    def start(self) -> None:
-        """Begin to draw."""
-        self._progress.start()
-
-    def show(self, work: Work | None) -> None:
-        """Draw the bar of this work; that of a finished stage stays, any other goes."""
-        if work is not self._work:
-            self._leave()
-            self._work = work
-            if work:
-                self._task = self._progress.add_task(work.name, total=work.total or None, text="")
-        if work and self._task is not None and work.total:
-            text = f"{work.done:,}/{work.total:,}  " + "  ".join(work.measures())
-            self._progress.update(self._task, completed=work.done, text=text)
-
-    def say(self, text: str) -> None:
-        """Write a line above the bars."""
-        self._progress.console.print(f"taic_jax: {text}", highlight=False)
-
-    def stop(self) -> None:
-        """Leave what is drawn as it is."""
-        self._leave()
-        self._progress.stop()
-
-    def _leave(self) -> None:
-        if self._work and self._task is not None:
-            self._progress.stop_task(self._task)
-            if not self._work.total:
-                self._progress.remove_task(self._task)
-        self._work = self._task = None
-
-
-class Lines(Display):
-    """A line where work without a measure first begins, every `INTERVAL` seconds, and at the end of each stage."""
-
-    def __init__(self) -> None:
         self._begun: set[str] = set()
-        self._work: Work | None = None
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._repeat, daemon=True)
 
     def start(self) -> None:
-        """Begin to write."""
+        """Begin to show."""
+        self._progress.start()
         self._thread.start()
 
-    def show(self, work: Work | None) -> None:
-        """Take this work for the lines to come."""
-        if work is not self._work:
-            if self._work and self._work.total:
-                self.say(self._work.line())
-            if work and not work.total and work.name not in self._begun:
-                self._begun.add(work.name)
-                self.say(work.line())
-        self._work = work
-
-    def say(self, text: str) -> None:
-        """Write a line."""
-        print(f"taic_jax: {text}", file=sys.stderr, flush=True)
-
     def stop(self) -> None:
-        """Write no more lines."""
+        """Leave what is drawn as it is, and write no more lines."""
+        self._progress.stop()
         self._ended.set()
         self._thread.join()
+
+    @contextlib.contextmanager
+    def showing(self, work: Work) -> Iterator[None]:
+        """Show this work in the context; the bar of a stage stays behind, any other goes."""
+        task = self._task = self._progress.add_task(work.name, total=work.total or None, text="")
+        self.update(work)
+        if not work.total and work.name not in self._begun:
+            self._begun.add(work.name)
+            self._write(work)
+        self._work = work
+        try:
+            yield
+        finally:
+            self._work = None
+            self._progress.stop_task(task)
+            if work.total:
+                self._write(work)
+            else:
+                self._progress.remove_task(task)
+
+    def update(self, work: Work) -> None:
+        """Draw how far this work has come."""
+        if work.total:
+            text = f"{work.done:,}/{work.total:,}  " + "  ".join(work.measures())
+            self._progress.update(self._task, completed=work.done, text=text)
+
+    def say(self, text: str) -> None:
+        """Write a line that stays, above the bars."""
+        self._console.print(f"taic_jax: {text}", highlight=False, markup=False, emoji=False, soft_wrap=True)
+
+    def _write(self, work: Work) -> None:
+        if self._progress.disable:
+            self.say(work.line())
 
     def _repeat(self) -> None:
         while not self._ended.wait(INTERVAL):
             if work := self._work:
-                self.say(work.line())
-
-
-def make_display(quiet: bool) -> Display:
-    """Return what suits standard error: a terminal, or a file."""
-    console = Console(stderr=True)
-    if quiet:
-        return Display()
-    return Bar(console) if console.is_terminal else Lines()
+                self._write(work)
 
 
 def _duration(seconds: float) -> str:

@@ -3,7 +3,6 @@
 import contextlib
 import json
 import shutil
-import tempfile
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -65,6 +64,14 @@ Row = dict[str, Any]
 """A row of metrics.jsonl: `stage`, `ticks` or `steps`, `time`, and each metric, a number or a list over seeds."""
 
 
+class RunFolderError(ValueError):
+    """The run folder cannot be used in this way."""
+
+
+class BusyError(RunFolderError):
+    """Another process is at the run folder."""
+
+
 @dataclass(frozen=True)
 class RunFolder:
     """The files of one run, by name, and their one reader."""
@@ -114,7 +121,7 @@ class RunFolder:
         return json.loads(self.summary_path.read_text())
 
     def metrics(self, stage: str | None = None) -> list[Row]:
-        """Read the rows, of one stage where asked; a half-written last one is left out."""
+        """Read the rows, of one stage where it is named; a half-written last one is left out."""
         lines = self.metrics_path.read_text().splitlines(keepends=True)
         rows = [json.loads(line) for line in lines if line.endswith("\n")]
         return [row for row in rows if stage in (None, row["stage"])]
@@ -123,115 +130,92 @@ class RunFolder:
         """Write the results; from then on the run is finished."""
         save_json(self.summary_path, summary)
 
+    @property
+    def _is_used(self) -> bool:
+        """Whether anything is there but an empty folder, or what a process killed at its very start leaves."""
+        if not self.path.is_dir():
+            return self.path.exists()
+        return any(path.suffix != PARTIAL and path.name != LOCK for path in self.path.iterdir())
 
-class RunFolderError(ValueError):
-    """The run folder cannot be used as asked."""
+    def check(self, config: Config, *, resume: bool = False, overwrite: bool = False) -> None:
+        """Check that a run can begin or resume in the folder, and change nothing.
 
+        Raises:
+          RunFolderError: it holds another run, or none where one is to be resumed or overwritten.
+        """
+        if resume:
+            if not self.begun:
+                raise RunFolderError(f"{self.path} holds no run to resume: no config.yaml in it")
+            old = dict(walk(self.config()))  # a field that is newer than the run has its default there
+            differing = [f"{name}: {value}" for name, value in walk(config) if old[name] != value]
+            if differing:
+                raise RunFolderError(f"{self.path} was run with another config, differing in {differing[:1]}")
+        elif self._is_used:
+            if not overwrite:
+                raise RunFolderError(f"{self.path} already holds files; add --resume, --overwrite or another --run-dir")
+            if not self.begun:
+                raise RunFolderError(
+                    f"{self.path} is not a run's folder (no config.yaml in it), so it is not overwritten"
+                )
+            for name in {config.options.source, *config.options.experience} - {"", COLLECT}:
+                if Path(name).resolve().is_relative_to(self.path.resolve()):
+                    raise RunFolderError(
+                        f"{self.path} holds what this run starts from, {name}, so it is not overwritten"
+                    )
 
-class BusyError(RunFolderError):
-    """Another process is at the run folder."""
+    def prepare(self, config: Config, *, resume: bool = False, overwrite: bool = False) -> None:
+        """Make the folder, or check that it is the one to resume; of several hosts the first does, and refuses for all.
 
+        Raises:
+          RunFolderError: it holds another run, or none where one is to be resumed, or cannot be written; or the hosts
+            have different configs.
+        """
+        checksum = zlib.crc32(to_yaml(config).encode()) >> 1  # a number of 31 bits
+        if agree([checksum]) != agree([checksum], least=True):
+            raise RunFolderError("--hosts: expected the same config on every host, got different ones")
+        refusal = None
+        if writes_here():
+            try:
+                self.check(config, resume=resume, overwrite=overwrite)
+                if not resume:
+                    self._begin(config)
+            except RunFolderError as error:
+                refusal = error
+        if any(agree([refusal is not None])):
+            raise refusal or RunFolderError(f"{self.path} cannot be used, as the first host tells")
 
-def prepare_folder(config: Config, run_dir: Path, *, resume: bool = False, overwrite: bool = False) -> None:
-    """Make the run folder, or check that it is the one to resume; of several hosts, the first does, and all hear of it.
-
-    Raises:
-      RunFolderError: the folder holds another run, or none where one is to be resumed, or cannot be written; or
-        the hosts were given different configs.
-    """
-    told = zlib.crc32(to_yaml(config).encode()) >> 1  # a number of 31 bits
-    if agree([told]) != agree([told], least=True):
-        raise RunFolderError("--hosts: expected the same config on every host, got different ones")
-    refused = None
-    if writes_here():
+    def _begin(self, config: Config) -> None:
+        if self._is_used:
+            with self.claimed():
+                for path in self.path.iterdir():
+                    if path.name != LOCK:
+                        shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
         try:
-            _prepare(config, run_dir, resume, overwrite)
-        except RunFolderError as error:
-            refused = error
-    if any(agree([refused is not None])):
-        raise refused or RunFolderError(f"{run_dir} cannot be used, as the first host tells")
+            with writing(self.path):
+                self.path.mkdir(parents=True, exist_ok=True)
+            save_text(self.config_path, to_yaml(config))
+        except SaveError as error:
+            raise RunFolderError(f"{error}; nothing was begun") from None
 
+    @contextlib.contextmanager
+    def claimed(self) -> Iterator[None]:
+        """Keep other processes off the folder; the system gives it back when this one ends, however it ends.
 
-def check_folder(config: Config, run_dir: Path, *, resume: bool = False, overwrite: bool = False) -> None:
-    """Check that the run folder can be used as asked, and change nothing.
+        What a process that was killed here left half-written is removed.
 
-    Raises:
-      RunFolderError: the folder holds another run, or none where one is to be resumed or overwritten.
-    """
-    if resume:
-        saved = run_dir / "config.yaml"
-        if not saved.is_file():
-            raise RunFolderError(f"{run_dir} holds no run to resume: no config.yaml in it")
-        old = dict(walk(load_config(str(saved))))  # a field that is newer than the run has its default there
-        differing = [f"{name}: {value}" for name, value in walk(config) if old[name] != value]
-        if differing:
-            raise RunFolderError(f"{run_dir} was run with another config, differing in {differing[:1]}")
-    elif _is_used(run_dir):
-        if not overwrite:
-            raise RunFolderError(f"{run_dir} already holds files; add --resume, --overwrite or another --run-dir")
-        if not (run_dir / "config.yaml").is_file():
-            raise RunFolderError(f"{run_dir} is not a run's folder (no config.yaml in it), so it is not overwritten")
-        for name in {config.options.source, *config.options.experience} - {"", COLLECT}:
-            if Path(name).resolve().is_relative_to(run_dir.resolve()):
-                raise RunFolderError(f"{run_dir} holds what this run starts from, {name}, so it is not overwritten")
-
-
-def _prepare(config: Config, run_dir: Path, resume: bool, overwrite: bool) -> None:
-    check_folder(config, run_dir, resume=resume, overwrite=overwrite)
-    if resume:
-        return
-    if _is_used(run_dir):
-        with claimed(run_dir):
-            for path in run_dir.iterdir():
-                if path.name != LOCK:
-                    shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
-    try:
-        with writing(run_dir):
-            run_dir.mkdir(parents=True, exist_ok=True)
-        save_text(run_dir / "config.yaml", to_yaml(config))
-    except SaveError as error:
-        raise RunFolderError(f"{error}; nothing was begun") from None
-
-
-@contextlib.contextmanager
-def claimed(run_dir: Path) -> Iterator[None]:
-    """Keep other processes off a run's folder; the system gives it back when this one ends, however it ends.
-
-    What a process that was killed here left half-written is removed.
-
-    Raises:
-      BusyError: another process is at it.
-      RunFolderError: it cannot be written.
-    """
-    if not writes_here():
-        yield
-        return
-    lock = filelock.FileLock(run_dir / LOCK)
-    try:
-        lock.acquire(blocking=False)
-    except filelock.Timeout:
-        raise BusyError(f"{run_dir} is being written by another process; wait for its end") from None
-    except OSError as error:
-        raise RunFolderError(f"{run_dir} cannot be written: {error.strerror}") from None
-    try:
-        remove_partial(run_dir)
-        yield
-    finally:
-        lock.release()
-
-
-def _is_used(run_dir: Path) -> bool:
-    """Return whether anything is there but an empty folder, or what a process killed at its very start leaves."""
-    if not run_dir.is_dir():
-        return run_dir.exists()
-    return any(path.suffix != PARTIAL and path.name != LOCK for path in run_dir.iterdir())
-
-
-@contextlib.contextmanager
-def log_folder(run_dir: Path) -> Iterator[Path]:
-    """Give the folder to log to: the run's own, or on a host that does not write, one that is thrown away."""
-    if writes_here():
-        yield run_dir
-        return
-    with tempfile.TemporaryDirectory() as folder:
-        yield Path(folder)
+        Raises:
+          BusyError: another process is at it.
+          RunFolderError: it cannot be written.
+        """
+        if not writes_here():
+            yield
+            return
+        try:
+            lock = filelock.FileLock(self.path / LOCK).acquire(blocking=False)
+        except filelock.Timeout:
+            raise BusyError(f"{self.path} is being written by another process; wait for its end") from None
+        except OSError as error:
+            raise RunFolderError(f"{self.path} cannot be written: {error.strerror}") from None
+        with lock:
+            remove_partial(self.path)
+            yield

@@ -1,4 +1,4 @@
-"""Why a run ends before its end: signals ask it to, after its iteration and saved, or no seed is left."""
+"""Why a run ends early: at a signal, after its iteration and saved, or because no seed is left."""
 
 import signal
 import sys
@@ -7,7 +7,7 @@ from typing import Any
 
 
 class Interrupted(BaseException):  # like KeyboardInterrupt, which no `except Exception` catches either
-    """A run stopped as it was asked to, with all that it had done saved."""
+    """A run stopped at a signal, with all that it had done saved."""
 
     def __init__(self, received: int):
         super().__init__(signal.Signals(received).name)
@@ -21,9 +21,8 @@ class DivergedError(ArithmeticError):
 class Signals:
     """Note SIGINT and SIGTERM while in the context, instead of ending in the middle of an iteration.
 
-    After the first SIGINT the next one ends the process at once, by the system's own doing: Python would only hear
-    of it when the compiled program returns. What was saved is whole either way. Outside the context nothing is
-    received. Only a main thread may enter it.
+    After the first one the next SIGINT ends the process at once, by the system's default: Python's handlers would wait
+    until the compiled program returns. What was saved is whole either way. Only a main thread may enter the context.
     """
 
     def __init__(self) -> None:

@@ -18,7 +18,7 @@ from taic_jax.config_io import to_yaml
 from taic_jax.pipeline import run_pipeline
 from taic_jax.runtime.files import save_json, save_table, save_text
 from taic_jax.runtime.pbt import Population, schedule
-from taic_jax.runtime.run_folder import LOCK, RunFolder, RunFolderError, claimed, prepare_folder
+from taic_jax.runtime.run_folder import LOCK, RunFolder, RunFolderError
 from taic_jax.runtime.signals import DivergedError
 from taic_jax.sweep.axes import Axis, Point, chunks, configs_of, show
 from taic_jax.sweep.marginals import draw_marginals
@@ -78,8 +78,8 @@ def run_sweep(
     if plan.pbt:
         bounds = {axis.name: axis.bounds for axis in axes}
         settings["population"] = Population(plan.pbt, bounds, config.seeds)
-    prepare_folder(config, run_dir, resume=resume, overwrite=overwrite)
-    with claimed(run_dir):
+    RunFolder(run_dir).prepare(config, resume=resume, overwrite=overwrite)
+    with RunFolder(run_dir).claimed():
         plan = _resumed(plan, run_dir) if resume else plan
         plan.save(run_dir)
         if resume and (run_dir / BEST).is_file():

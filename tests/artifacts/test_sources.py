@@ -18,7 +18,7 @@ from taic_jax.options.dataset import Experience
 from taic_jax.options.model import make_networks
 from taic_jax.run import main
 from taic_jax.runtime.checkpoint import load_arrays
-from taic_jax.runtime.driver import STAGES
+from taic_jax.runtime.driver import STAGE_STREAMS
 from taic_jax.types import as_arrays
 
 # Nothing is collected where no baseline is asked for.
@@ -96,7 +96,7 @@ def test_without_steps_the_decoder_is_as_it_was_drawn():
     assert main_with(config) == 0
     networks = make_networks(config.options, 2, 2)
     for seed in range(2):
-        key = jax.random.fold_in(jax.random.key(seed), STAGES.index("learn"))
+        key = jax.random.fold_in(jax.random.key(seed), STAGE_STREAMS["learn"])
         drawn = learning.init(as_arrays(config.options), networks, key).params["decoder"]["params"]["head"]["kernel"]
         np.testing.assert_allclose(options()["params.decoder.params.head.kernel"][seed], drawn, rtol=1e-5)
     assert {path.name for path in Path("new/checkpoints").iterdir()} == {"train"}

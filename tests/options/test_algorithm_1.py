@@ -22,7 +22,7 @@ CONFIG = OptionsConfig(
     lambda_kl=0.5, lambda_pred=2.0, lambda_adv=0.3,
 )  # fmt: skip
 
-program = jax.jit(jax.value_and_grad(total_loss, has_aux=True), static_argnums=1)
+program = jax.jit(jax.value_and_grad(total_loss, has_aux=True))
 
 
 @partial(jax.jit, static_argnums=0)

@@ -76,6 +76,7 @@ def problem() -> tuple[dict, OptionModel, Window, jax.Array]:
         Scale(draw(STATE_SIZE), jnp.exp(draw(STATE_SIZE))),
         Scale(draw(STATE_SIZE), jnp.exp(draw(STATE_SIZE))),
         jnp.ones(()),
+        NETWORKS,
     )
     mask = jnp.tile(jnp.array([True, True, False]), (NUM_WINDOWS, 1))
     windows = Window(draw(NUM_WINDOWS, 4, STATE_SIZE), draw(NUM_WINDOWS, 3, ACTION_SIZE), mask)

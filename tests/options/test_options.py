@@ -27,7 +27,7 @@ NETWORKS = make_networks(CONFIG, STATE_SIZE, ACTION_SIZE)
 @pytest.fixture(scope="module")
 def model() -> OptionModel:
     """Return a model of random parameters, whose scales change nothing."""
-    return with_unit_scales(random_model(CONFIG, STATE_SIZE, ACTION_SIZE)[1])
+    return with_unit_scales(random_model(CONFIG, STATE_SIZE, ACTION_SIZE))
 
 
 def with_unit_scales(model: OptionModel) -> OptionModel:

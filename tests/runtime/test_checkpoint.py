@@ -5,6 +5,7 @@ import shutil
 import subprocess
 import sys
 import time
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -192,6 +193,19 @@ def test_checkpoints_of_another_version_are_told(tmp_path, monkeypatch):
     checkpoints.load(1, {"x": jnp.ones(3)})
     with pytest.raises(ArtifactError, match=r"at y, got nothing; taic_jax 0.0.9 wrote it, this is 9.8.7"):
         checkpoints.load(1, {"x": jnp.ones(3), "y": jnp.ones(3)})
+
+
+def test_the_layout_of_a_checkpoint_is_as_it_always_was(tmp_path):
+    """Checkpoints of earlier versions are resumed from."""
+    checkpoints = Checkpoints(tmp_path)
+    checkpoints.save(1, {"x": jnp.array([1.0, 2.0]), "a": {"key": jax.random.key(3, impl="threefry2x32")}})
+    checkpoints.wait()
+    stored = ocp.metadata(str(tmp_path / "1")).custom_metadata
+    assert stored["layout"] == [["a.key", "uint32", [2]], ["x", "float32", [2]]]
+    packed = np.concatenate([np.uint32([0, 3]).view(np.uint8), np.float32([1, 2]).view(np.uint8)])
+    assert stored["crc32"] == {"bytes": zlib.crc32(packed.data)} and set(stored) == {"taic_jax", "crc32", "layout"}
+    loaded = ocp.load(str(tmp_path / "1"))
+    np.testing.assert_array_equal(loaded["bytes"], packed)
 
 
 def test_checkpoints_of_one_array_for_each_leaf_are_read(tmp_path):

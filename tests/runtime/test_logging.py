@@ -8,7 +8,8 @@ import pytest
 from tensorboardX.proto.event_pb2 import Event  # pyright: ignore[reportAttributeAccessIssue]
 from tensorboardX.proto.summary_pb2 import HistogramProto  # pyright: ignore[reportAttributeAccessIssue]
 
-from taic_jax.runtime.logging import RunLogger, read_metrics
+from taic_jax.runtime.logging import RunLogger
+from taic_jax.runtime.run_folder import RunFolder
 
 
 def read_events(run_dir) -> dict[tuple[str, int], float]:
@@ -40,7 +41,7 @@ def _read_events(run_dir) -> tuple[dict, dict]:
 def test_rows_hold_one_number_per_seed_and_events_their_mean(tmp_path):
     with RunLogger(tmp_path) as logger:
         logger.log("train", 64, {"return": jnp.array([1.0, 3.0]), "ppo/entropy": 0.5, "episodes": 3})
-    (row,) = read_metrics(tmp_path / "metrics.jsonl")
+    (row,) = RunFolder(tmp_path).metrics()
     assert row.pop("time") > 0
     assert row == {
         "stage": "train",
@@ -65,7 +66,7 @@ def test_what_is_not_finite_is_null(tmp_path):
 def test_rows_are_on_disk_at_once(tmp_path):
     with RunLogger(tmp_path) as logger:
         logger.log("train", 1, {})
-        assert len(read_metrics(tmp_path / "metrics.jsonl")) == 1
+        assert len(RunFolder(tmp_path).metrics()) == 1
 
 
 def log_two_stages(logger: RunLogger) -> None:
@@ -82,7 +83,7 @@ def test_truncate_drops_rows_and_events_after_the_checkpoint(tmp_path):
     with RunLogger(tmp_path) as logger:
         logger.truncate("train", 20)
         logger.log("train", 30, {"return": 7.0})
-    kept = [(row["stage"], row["ticks"]) for row in read_metrics(tmp_path / "metrics.jsonl")]
+    kept = [(row["stage"], row["ticks"]) for row in RunFolder(tmp_path).metrics()]
     assert kept == [
         ("collect", 10),
         ("collect", 20),
@@ -110,7 +111,7 @@ def test_counts_are_a_list_per_seed_and_a_histogram_over_seeds(tmp_path):
     with RunLogger(tmp_path) as logger:
         logger.log("train", 64, {"durations": jnp.asarray(COUNTS), "return": jnp.array([1.0, 3.0])})
         logger.log("train", 128, {"durations": np.zeros((2, 3), np.float32)})  # no option ended
-    first, second = read_metrics(tmp_path / "metrics.jsonl")
+    first, second = RunFolder(tmp_path).metrics()
     assert first["train/durations"] == [[1.0, 0.0, 4.0], [2.0, 0.0, 3.0]]
     assert second["train/durations"] == [[0.0, 0.0, 0.0], [0.0, 0.0, 0.0]]
     assert read_events(tmp_path) == {("train/return", 64): 2.0}
@@ -128,7 +129,7 @@ def test_counts_survive_truncation(tmp_path):
     events.rename(events.with_name("events.out.tfevents.0.of-an-hour-ago"))
     with RunLogger(tmp_path) as logger:
         logger.truncate("train", 10)
-    (row,) = read_metrics(tmp_path / "metrics.jsonl")
+    (row,) = RunFolder(tmp_path).metrics()
     assert row["train/durations"] == COUNTS.tolist()
     histograms = read_histograms(tmp_path)
     assert set(histograms) == {("train/durations", 10)}
@@ -139,7 +140,7 @@ def test_truncate_to_nothing_drops_the_whole_stage(tmp_path):
     with RunLogger(tmp_path) as logger:
         log_two_stages(logger)
         logger.truncate("collect", -1)
-    assert {row["stage"] for row in read_metrics(tmp_path / "metrics.jsonl")} == {"train"}
+    assert {row["stage"] for row in RunFolder(tmp_path).metrics()} == {"train"}
     assert {name for name, _ in read_events(tmp_path)} == {"train/return"}
 
 
@@ -148,7 +149,7 @@ def test_a_half_written_row_is_dropped(tmp_path):
     with RunLogger(tmp_path) as logger:
         log_two_stages(logger)
     path.write_text(path.read_text() + '{"stage": "train", "ti')
-    assert len(read_metrics(path)) == 6
+    assert len(RunFolder(tmp_path).metrics()) == 6
     with RunLogger(tmp_path) as logger:
         logger.log("train", 40, {})
-    assert [row["ticks"] for row in read_metrics(path)] == [10, 20, 30, 10, 20, 30, 40]
+    assert [row["ticks"] for row in RunFolder(tmp_path).metrics()] == [10, 20, 30, 10, 20, 30, 40]
