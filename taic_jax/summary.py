@@ -16,10 +16,12 @@ from taic_jax.analysis.statistics import iqm, summarize
 from taic_jax.artifacts.experience import experience_bytes
 from taic_jax.config import COLLECT, METHOD_LABELS, Config, collector_is_baseline, experience_ticks, needs_collect
 from taic_jax.envs.base import Env
+from taic_jax.envs.rendering import write_webp
 from taic_jax.nonfinite import FINITE, QUANTITIES
 from taic_jax.rl.ppo import Agent, num_iterations
 from taic_jax.runtime.driver import Run, Stopped
-from taic_jax.runtime.files import whole_file, writes_here
+from taic_jax.runtime.files import json_safe, whole_file, writes_here
+from taic_jax.runtime.run_folder import Method, Summary
 
 PACKAGES = ("taic_jax", "jax", "jaxlib", "flax", "optax", "brax", "mujoco", "mujoco-mjx", "orbax-checkpoint")
 MIB = 2**20
@@ -54,7 +56,7 @@ def plan(config: Config, env: Env, source: Env) -> str:
     return "\n".join(lines)
 
 
-def as_summary(run: Run, methods: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+def as_summary(run: Run, methods: Mapping[str, Mapping[str, Any]]) -> Summary:
     """Return the contents of `summary.json`.
 
     Args:
@@ -73,7 +75,7 @@ def as_summary(run: Run, methods: Mapping[str, Mapping[str, Any]]) -> dict[str, 
     }
 
 
-def as_table(summary: Mapping[str, Any]) -> Table:
+def as_table(summary: Summary) -> Table:
     """Return the returns of a summary, a row a method: interquartile means over seeds, and their 95 % intervals."""
     table = Table("method", box=SIMPLE, title="return of an episode", title_justify="left", title_style="")
     for column in ("untrained", "trained, as it explores", "its mean options or actions"):
@@ -101,12 +103,12 @@ def _stopped(seeds: Stopped) -> dict[str, dict[str, Any]]:
     }
 
 
-def _method(first: Mapping[str, Mapping], last: Mapping[str, Mapping]) -> dict[str, Any]:
+def _method(first: Mapping[str, Mapping], last: Mapping[str, Mapping]) -> Method:
     """Summarise every evaluated quantity over seeds; `return` is of the policy as it explores."""
-    result = {}
+    result: Any = {}
     for mode in last:
         result[mode] = summarize(last[mode]["return"])
-        result[mode]["first_per_seed"] = np.asarray(first[mode]["return"], float).tolist()
+        result[mode]["first_per_seed"] = json_safe(np.asarray(first[mode]["return"], float))
     metrics = dict(last["return_mean_option"])
     del metrics["durations"]
     result["duration"] = _durations(np.asarray(last["return"]["durations"], float))
@@ -118,7 +120,7 @@ def _durations(counts: np.ndarray) -> dict[str, Any]:
     """Summarise how many options [K, L] took 1..L ticks: the mean per seed, and the share of each over all seeds."""
     ticks = np.arange(1, counts.shape[1] + 1)
     means = counts @ ticks / counts.sum(axis=1)
-    return summarize(means) | {"histogram": (counts.sum(axis=0) / counts.sum()).tolist()}
+    return {**summarize(means), "histogram": json_safe(counts.sum(axis=0) / counts.sum())}
 
 
 def _version(name: str) -> str | None:
@@ -145,8 +147,6 @@ def commit() -> str | None:
 
 def write_video(run: Run, env: Env, agent: Agent) -> None:
     """Write `video.webp`: the first seed's policy taking its mean options."""
-    from taic_jax.envs.rendering import write_webp  # it imports matplotlib, which takes a while
-
     ticks = run.config.evaluate.video_ticks
     if not ticks or not writes_here():
         return

@@ -38,7 +38,7 @@ class Returns(Statistics):
 class Durations(Statistics):
     """Mean ticks of an option, and the share of each duration 1..L."""
 
-    histogram: list[float]
+    histogram: list[float | None]
 
 
 Method = TypedDict(
