@@ -40,6 +40,16 @@ hypothesis.settings.register_profile("taic_jax", deadline=None, max_examples=25)
 hypothesis.settings.load_profile("taic_jax")
 
 
+HEAVY = ("kills", "readme", "hosts", "sweep", "signals", "throughput", "transfer", "pipeline", "pbt", "files")
+"""Files that take longest. They are begun first, or one process would still be at the last while the others idle."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the tests of heavy files first; pytest-xdist is told to keep this order."""
+    names = [f"test_{name}.py" for name in HEAVY]
+    items.sort(key=lambda item: names.index(item.path.name) if item.path.name in names else len(names))
+
+
 def check_functions(function: Callable) -> Callable:
     """Check the types and shapes of a call, but for a dataclass's `__init__`: JAX rebuilds trees with placeholders."""
     return function if function.__name__ == "__init__" else beartype.beartype(function)

@@ -129,19 +129,20 @@ def test_a_transfer_run_that_was_interrupted_ends_as_if_it_had_not_been(source, 
 
 
 def test_baselines_take_their_ticks_and_hold_their_actions(source, tmp_path):
-    """The collector would have had other ticks than flat, so that it is not run."""
-    run_pipeline(using(source, seeds=3, collect__ticks=64, train__baselines=("flat", "repeat", "total")), tmp_path)
+    """The collector would have had other ticks than flat, so that it is not run; but its PPO is that of flat ones."""
+    fields = {"collect__ticks": 64, "collect__ppo__rollout_length": 4, "collect__ppo__minibatch_size": 8}
+    run_pipeline(using(source, seeds=3, **fields, train__baselines=("flat", "repeat", "total")), tmp_path)
     assert stages_of(tmp_path) == {"train", "flat", "repeat", "total"}
     assert list(methods_of(tmp_path)) == ["taic", "flat", "repeat", "total"]
     rows = {name: [row for row in rows_of(tmp_path) if row["stage"] == name] for name in STAGE_STREAMS}
-    thrice = [16, 32, 48]
-    assert {name: [row["ticks"] for row in rows[name]] for name in ("flat", "repeat", "total")} == {
-        "flat": thrice,
-        "repeat": thrice,
-        "total": [*thrice, 64, 80, 96, 112],
+    assert {name: [row["ticks"] for row in rows[name]] for name in ("train", "flat", "repeat", "total")} == {
+        "train": [16, 32, 48],
+        "flat": list(range(8, 49, 8)),
+        "repeat": list(range(8, 49, 8)),
+        "total": list(range(8, 113, 8)),
     }
-    # A rollout is 8 ticks in 2 environments, and no episode ends in it; an option lasts 2 ticks.
-    for name, decisions in {"flat": 16.0, "repeat": 8.0, "total": 16.0}.items():
+    # A rollout is 4 ticks in 2 environments, and no episode ends in it; an option lasts 2 ticks. Options take 8 ticks.
+    for name, decisions in {"train": 8.0, "flat": 8.0, "repeat": 4.0, "total": 8.0}.items():
         assert all(row[f"{name}/decisions"] == [decisions] * 3 for row in rows[name])
     assert methods_of(tmp_path)["repeat"]["duration"]["histogram"][1] > 0.9
     assert json.loads((tmp_path / "summary.json").read_text())["ticks"] == 3 * (48 + 48 + 48 + 112)

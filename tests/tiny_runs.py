@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from taic_jax import pipeline
+from taic_jax import trainer
 from taic_jax.config import CollectConfig, Config, EvaluateConfig, OptionsConfig, PPOConfig, TrainConfig
 from taic_jax.runtime import driver
 from taic_jax.runtime.checkpoint import Checkpoints, load_arrays
@@ -55,7 +55,7 @@ def tiny_steps() -> Iterator[None]:
     """Save a checkpoint at every step, and log every second one."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(driver, "CHECKPOINT_SECONDS", 0.0)
-        patch.setattr(pipeline, "STEPS_PER_LOG", 2)
+        patch.setattr(trainer, "STEPS_PER_LOG", 2)
         yield
 
 

@@ -81,6 +81,15 @@ def test_probability_of_improvement_by_hand():
     assert probability_of_improvement([1, 1], [1, 1])[0] == 0.5
 
 
+@pytest.mark.parametrize("of_x", [True, False])
+def test_the_interval_of_improvement_covers_95_percent_of_resampled_seeds(of_x):
+    """One seed against fifty that it beats half of: the share of fifty draws is binomial."""
+    many, one = np.repeat([-1.0, 1.0], 25), [0.0]
+    share, interval = probability_of_improvement(many, one) if of_x else probability_of_improvement(one, many)
+    assert share == 0.5
+    np.testing.assert_allclose(interval, stats.binom.ppf([0.025, 0.975], 50, 0.5) / 50)
+
+
 def test_a_stratified_interval_never_mixes_groups():
     """Two groups of equal values each: however they are resampled, the middle half is the same."""
     low, high = stratified_interval([np.zeros((4, 3)), np.ones((4, 3))])

@@ -6,17 +6,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from probes import draw, random_model
 
 from taic_jax.config import OptionsConfig
 from taic_jax.options import losses
 from taic_jax.options.dataset import Window
 from taic_jax.options.learning import total_loss
-from taic_jax.options.model import OptionModel, Scale, init_params, make_networks
+from taic_jax.options.model import OptionModel
 from taic_jax.types import as_arrays
 
 CONFIG = OptionsConfig(length=3, size=2, hidden_size=3, mlp_sizes=(4,), lambda_kl=0.5, lambda_pred=2.0)
 STATE_SIZE, ACTION_SIZE, NUM_WINDOWS = 3, 2, 4
-NETWORKS = make_networks(CONFIG, STATE_SIZE, ACTION_SIZE)
 
 
 def test_reconstruction_loss_by_hand():
@@ -64,23 +64,10 @@ def test_gradient_reversal_flips_and_scales():
 @pytest.fixture(scope="module")
 def problem() -> tuple[dict, OptionModel, Window, jax.Array]:
     """Random parameters, scales and windows whose last action is masked, and the noise of their options."""
-    rng = np.random.default_rng(1)
-
-    def draw(*shape: int) -> jax.Array:
-        return jnp.asarray(rng.normal(size=shape), jnp.float32)
-
-    shapes = jax.eval_shape(lambda: init_params(NETWORKS, CONFIG, jax.random.key(0)))
-    params = jax.tree.map(lambda leaf: draw(*leaf.shape), shapes)
-    model = OptionModel(
-        params,
-        Scale(draw(STATE_SIZE), jnp.exp(draw(STATE_SIZE))),
-        Scale(draw(STATE_SIZE), jnp.exp(draw(STATE_SIZE))),
-        jnp.ones(()),
-        NETWORKS,
-    )
+    rng, model = np.random.default_rng(1), random_model(CONFIG, STATE_SIZE, ACTION_SIZE)
     mask = jnp.tile(jnp.array([True, True, False]), (NUM_WINDOWS, 1))
-    windows = Window(draw(NUM_WINDOWS, 4, STATE_SIZE), draw(NUM_WINDOWS, 3, ACTION_SIZE), mask)
-    return params, model, windows, draw(NUM_WINDOWS, CONFIG.size)
+    windows = Window(draw(rng, NUM_WINDOWS, 4, STATE_SIZE), draw(rng, NUM_WINDOWS, 3, ACTION_SIZE), mask)
+    return model.params, model, windows, draw(rng, NUM_WINDOWS, CONFIG.size)
 
 
 @jax.jit
@@ -94,9 +81,9 @@ def adversarial_alone(params: dict, model: OptionModel, windows: Window, noise: 
     """L_adv written out, with no reversal in it."""
 
     def one(window: Window, noise: jax.Array) -> jax.Array:
-        means, log_stds = NETWORKS.encoder.apply(params["encoder"], window.actions)
+        means, log_stds = model.replace(params=params).encode(window.actions)
         option = means[1] + jnp.exp(log_stds[1]) * noise  # the last action of the mask is the second
-        estimated = NETWORKS.estimator.apply(params["estimator"], option)
+        estimated = model.replace(params=params).estimate(option)
         true = model.state_scale(window.states[jnp.array([0, 2])])  # the last action leads to the third state
         return jnp.mean((estimated - true) ** 2)
 

@@ -4,6 +4,7 @@ import json
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -24,6 +25,15 @@ def tiny():
         yield
 
 
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory) -> Path:
+    """Return the folder of a run that was not told to stop."""
+    folder = tmp_path_factory.mktemp("whole")
+    (folder / "config.yaml").write_text(to_yaml(CONFIG))
+    assert main([str(folder / "config.yaml"), "--run-dir", str(folder / "run")]) == 0
+    return folder / "run"
+
+
 def receive_at(monkeypatch: pytest.MonkeyPatch, number: int, row: int) -> None:
     """Send this process a signal when it has logged so many rows."""
     original, rows = RunLogger.log, []
@@ -38,7 +48,7 @@ def receive_at(monkeypatch: pytest.MonkeyPatch, number: int, row: int) -> None:
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 75)])
-def test_a_signal_lets_the_iteration_end_and_saves(tmp_path, monkeypatch, capfd, number, code):
+def test_a_signal_lets_the_iteration_end_and_saves(whole, tmp_path, monkeypatch, capfd, number, code):
     monkeypatch.setattr(driver, "CHECKPOINT_SECONDS", 1e9)  # nothing is saved before its time but by the signal
     monkeypatch.chdir(tmp_path)
     (tmp_path / "config.yaml").write_text(to_yaml(CONFIG))
@@ -51,10 +61,9 @@ def test_a_signal_lets_the_iteration_end_and_saves(tmp_path, monkeypatch, capfd,
     assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
     assert Checkpoints(tmp_path / "run/checkpoints/collect").steps() == [2]
     assert main(["--run-dir", "run", "--resume"]) == 0
-    assert main(["config.yaml", "--run-dir", "whole"]) == 0
-    whole, resumed = (json.loads((tmp_path / name / "summary.json").read_text()) for name in ("whole", "run"))
-    assert whole["methods"] == resumed["methods"] and whole["ticks"] == resumed["ticks"]
-    trees = [tmp_path / name / "checkpoints/train/3" for name in ("whole", "run")]
+    expected, resumed = (json.loads((folder / "summary.json").read_text()) for folder in (whole, tmp_path / "run"))
+    assert expected["methods"] == resumed["methods"] and expected["ticks"] == resumed["ticks"]
+    trees = [folder / "checkpoints/train/3" for folder in (whole, tmp_path / "run")]
     for a, b in zip(*(jax.tree.leaves(load_arrays(tree)) for tree in trees), strict=True):
         np.testing.assert_array_equal(a, b)
 

@@ -30,14 +30,29 @@ def tiny():
         yield
 
 
-@pytest.fixture(autouse=True)
-def in_folder_with_config(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def enter(folder: Path, patch: pytest.MonkeyPatch) -> None:
+    """Go into a folder with a config and its task."""
+    patch.chdir(folder)
     Path("slope.py").write_text(SLOPE)
     Path("config.yaml").write_text(to_yaml(with_fields(CONFIG, env__name="slope.py:Slope")))
 
 
-def table_of(folder: str) -> list[dict[str, str]]:
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory, tiny) -> Path:
+    """Return the folder of a sweep over four points, two of which fit a program, that nothing interrupted."""
+    folder = tmp_path_factory.mktemp("whole")
+    with pytest.MonkeyPatch.context() as patch:
+        enter(folder, patch)
+        assert main(["config.yaml", "--run-dir", "run", "--axes", RATE, LENGTH, *FEW]) == 0
+    return folder / "run"
+
+
+@pytest.fixture(autouse=True)
+def in_folder_with_config(tmp_path, monkeypatch):
+    enter(tmp_path, monkeypatch)
+
+
+def table_of(folder: str | Path) -> list[dict[str, str]]:
     with Path(folder, "table.csv").open(newline="") as file:
         return list(csv.DictReader(file))
 
@@ -66,13 +81,12 @@ def test_axes_by_hand():
     assert configs_of(Config(), points)[3].options.size == 4
 
 
-def test_each_point_is_the_run_that_it_would_be_alone():
-    assert main(["config.yaml", "--run-dir", "all", "--axes", RATE, LENGTH, *FEW]) == 0
-    rows = table_of("all")
+def test_each_point_is_the_run_that_it_would_be_alone(whole):
+    rows = table_of(whole)
     assert [(row["train.ppo.learning_rate"], row["options.length"]) for row in rows] == [
         ("0.0003", "2"), ("0.0003", "3"), ("0.03", "2"), ("0.03", "3"),
     ]  # fmt: skip
-    assert sorted(path.name for path in Path("all").glob("chunk-*")) == ["chunk-000", "chunk-001"]
+    assert sorted(path.name for path in whole.glob("chunk-*")) == ["chunk-000", "chunk-001"]
     changes = ["--train.ppo.learning-rate", "0.03", "--options.length", "3"]
     assert run(["config.yaml", "--run-dir", "one", *changes]) == 0
     alone = json.loads(Path("one/summary.json").read_text())["methods"]["taic"]["return"]
@@ -80,18 +94,17 @@ def test_each_point_is_the_run_that_it_would_be_alone():
     assert float(rows[3]["iqm"]) == pytest.approx(alone["iqm"], rel=1e-3)
     assert len({row["per_seed"] for row in rows}) == 4
 
-    best = load_config("all/best.yaml")
+    best = load_config(str(whole / "best.yaml"))
     top = max(rows, key=lambda row: float(row["iqm"]))
     assert (best.train.ppo.learning_rate, best.options.length) == (
         float(top["train.ppo.learning_rate"]), int(top["options.length"]),
     )  # fmt: skip
-    with Image.open("all/marginals.png") as picture:
+    with Image.open(whole / "marginals.png") as picture:
         assert picture.size[0] > 600 and len(picture.convert("L").getcolors()) > 10
 
 
-def test_an_interrupted_sweep_ends_as_if_it_had_not_been(monkeypatch, capfd):
+def test_an_interrupted_sweep_ends_as_if_it_had_not_been(whole, monkeypatch, capfd):
     args = ["config.yaml", "--axes", RATE, LENGTH, *FEW]
-    assert main([*args, "--run-dir", "whole"]) == 0
     for i, count in enumerate((2, None, 2)):
         with monkeypatch.context() as patch, pytest.raises(KilledError):
             if count is None:  # in the end of the first chunk, whose checkpoints are still there
@@ -101,7 +114,7 @@ def test_an_interrupted_sweep_ends_as_if_it_had_not_been(monkeypatch, capfd):
             main([*args, "--run-dir", "cut", *(["--resume"] if i else [])])
     assert main([*args, "--run-dir", "cut", "--resume"]) == 0
     for name in ("table.csv", "best.yaml"):
-        assert Path("cut", name).read_bytes() == Path("whole", name).read_bytes()
+        assert Path("cut", name).read_bytes() == (whole / name).read_bytes()
     assert not list(Path("cut").glob("chunk-*/checkpoints"))
     capfd.readouterr()
     assert main([*args, "--run-dir", "cut", "--resume"]) == 0
