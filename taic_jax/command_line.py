@@ -1,4 +1,4 @@
-"""Share among the command lines: a config by name, its fields as options, and answers in one line.
+"""The common part of the command lines: a config by name, its fields as options, and errors in one line.
 
 Arguments are parsed and checked before JAX is imported, so that help and mistakes answer at once.
 """
@@ -45,23 +45,23 @@ class Command:
     overwrite: tyro.conf.FlagCreatePairsOff[bool] = False
     """Replace the run in --run-dir."""
     dry_run: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Refuse what the run would refuse, print the configuration and the plan, and stop."""
+    """Check all that the run would refuse, print the configuration and the plan, and stop."""
     quiet: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Show neither progress nor the table at the end, only the path of what was written."""
+    """Show neither progress nor the table at the end, only the path of the results."""
     version: tyro.conf.FlagCreatePairsOff[bool] = False
     """Print the version and stop."""
     checkpoint_seconds: float = 30.0
-    """Least seconds between two checkpoints of a stage; 0 makes one every iteration."""
+    """Least seconds between two checkpoints of a stage; 0 writes one every iteration."""
     shard: Shard = "auto"
     """Split over devices (accelerators, or the cores of a CPU): the seeds of all points, or the environments of each
     seed; auto splits the seeds where there are several."""
     options: Annotated[str, tyro.conf.arg(metavar="RUN")] = ""
-    """Run or artifact whose option model is used as it is; short for --options.source."""
+    """Run or artifact whose option model is used unchanged; short for --options.source."""
     config: Annotated[Config, tyro.conf.arg(name=""), tyro.conf.FlagConversionOff] = Config()
 
     @property
     def folder(self) -> Path:
-        """Where to run."""
+        """The run's folder."""
         return self.run_dir or Path("runs") / f"{Path(self.source).stem}-{time.strftime('%Y%m%d-%H%M%S')}"
 
 
@@ -92,24 +92,24 @@ def tell(work: Callable[[], int | None]) -> int:
     """Return the exit code of `work`, None being 0, or 2 after one line that names the user's mistake."""
     try:
         code = work() or 0
-        sys.stdout.flush()  # at the end of the process a reader that has gone would be an error
+        sys.stdout.flush()  # here, since a closed pipe at the end of the process would be an error
         return code
     except KeyboardInterrupt:
         print("taic_jax: interrupted", file=sys.stderr)
         return 130
-    except BrokenPipeError:  # the reader, such as head, has seen enough
+    except BrokenPipeError:  # a reader such as head has closed the pipe
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except (ValueError, OSError) as error:
         ours = type(error).__module__.partition(".")[0] == "taic_jax"
-        if not ours and getattr(error, "filename", None) is None:  # of no file either: a mistake of the program
+        if not ours and getattr(error, "filename", None) is None:  # not about a file either: a bug
             raise
         return _fail(2, str(error))
 
 
 def attempt(work: Callable[[Signals], object], run_dir: Path) -> int:
-    """Do the work of a run and return its exit code: 0, FAILED if every seed diverged, UNWRITTEN if it could not write,
-    or one of EXIT_CODES if a signal stopped it and all that was done is saved."""
+    """Do the work of a run and return its exit code: 0, FAILED if every seed diverged, UNWRITTEN if a write failed, or
+    one of EXIT_CODES if a signal stopped it after a checkpoint."""
     try:
         with Signals() as signals:
             work(signals)
@@ -133,7 +133,7 @@ def _fail(code: int, message: str) -> int:
 
 
 def parse(args: Sequence[str], program: str, kind: type[C]) -> C:
-    """Parse and check the arguments over the preset or file that they name; raise `ConfigError` at a mistake."""
+    """Parse and check the arguments, over the preset or file that they name; raise `ConfigError` at a mistake."""
 
     def parse_over(source: str) -> C:
         description = f"{kind.__doc__}\n\nPresets: {', '.join(preset_names())}."
@@ -175,7 +175,7 @@ def typed(args: Sequence[str], program: str, kind: type[K], description: str | N
 
 
 def _explain(args: Sequence[str], command: type) -> ConfigError:
-    """Return the error for the argument that tyro refused, found by parsing each option alone."""
+    """Return the error for the argument that tyro refused, by parsing each option alone."""
     types = {name.removeprefix("config."): kind for name, kind in field_types(command).items()}
     configured = types.pop("source", None)
     types.pop("runs", None)  # the positional argument of reports

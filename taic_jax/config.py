@@ -37,7 +37,7 @@ Positive = Annotated[float, Bounds(TINY)]
 Share = Annotated[float, Bounds(0, 1)]
 LogStd = Annotated[float, Bounds(-20, 2)]
 Shard = Literal["auto", "none", "seeds", "envs"]
-"""What is split over devices; no part of an experiment, but needed without JAX."""
+"""The axis to split over devices; it is not a part of an experiment, but is needed without JAX."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class EnvConfig:
     body: Literal["gym", "hiro"] = "gym"
     """Ant of ant, ant_maze, ant_push and ant_fall: Gym's, or HIRO's, which is weaker and acts half as often."""
     goal: Literal["fixed", "near", "uniform"] = "fixed"
-    """Goal of ant_maze: behind the walls, at the end of the first corridor, or drawn in each episode of training and
+    """Goal of ant_maze: behind the walls, at the end of the first corridor, or random in each episode of training and
     behind the walls in evaluation."""
     change_after: Natural = 0
     """Episodes of each environment after which the room of nav2d changes; 0 for never."""
@@ -96,9 +96,9 @@ class PPOConfig:
     log_std_init: LogStd = -0.916
     """Initial log standard deviation of the policy; exp(-0.916) = 0.4."""
     reset_at_change: bool = False
-    """Set it to log_std_reset where the task changes (env.change_after), once half of the environments have."""
+    """Set it to log_std_reset as soon as the task has changed (env.change_after) in half of the environments."""
     log_std_reset: LogStd = 0.0
-    """Log standard deviation from which exploration starts anew there."""
+    """Log standard deviation of the policy after that reset."""
     normalize_advantage: bool = True
     """Standardise the advantages of each minibatch."""
     normalize_reward: bool = True
@@ -114,7 +114,7 @@ class CollectConfig:
     ticks: int = 1_000_000
     """Budget of interactions per seed."""
     capacity: Natural = 0
-    """Newest ticks of experience that are kept, per seed; 0 keeps all."""
+    """Newest ticks of experience to keep, per seed; 0 keeps all."""
     ppo: PPOConfig = PPOConfig()
 
 
@@ -123,11 +123,11 @@ class OptionsConfig:
     """Stage learn: the option model, networks E, D, P and F (sections 3.2 to 3.4)."""
 
     source: str = ""
-    """Run or artifact whose option model is used as it is (--options for short); empty learns one."""
+    """Run or artifact whose option model is used unchanged (--options for short); empty learns one."""
     experience: tuple[str, ...] = ()
-    """What to learn from: collect, folders of other runs, demonstrations (.npz, Minari); empty takes collect."""
+    """Sources to learn from: collect, folders of other runs, demonstrations (.npz, Minari); empty takes collect."""
     length: int = 5
-    """Ticks of a window and an option under termination fixed; otherwise the most they may take."""
+    """Ticks of a window and of an option under termination fixed; otherwise the greatest number."""
     size: int = 6
     """Dimensions of the option code o."""
     hidden_size: int = 64
@@ -139,7 +139,7 @@ class OptionsConfig:
     decoder_sizes: tuple[int, ...] = (128, 128)
     """Widths of the hidden layers of a closed-loop D."""
     termination: Literal["fixed", "output", "predict"] = "fixed"
-    """When an option ends: after length ticks, at D's end signal, or when P is surprised (section 3.4)."""
+    """End of an option: after length ticks, at D's end signal, or when P is surprised (section 3.4)."""
     shortest: int = 1
     """Fewest ticks of the windows that termination output learns from."""
     end_signal: Literal["sampled", "threshold"] = "sampled"
@@ -147,9 +147,9 @@ class OptionsConfig:
     delta: Positive = 0.5
     """Threshold on P's error at which termination predict ends an option (Algorithm 1)."""
     delta_unit: Literal["error", "quantile"] = "quantile"
-    """What delta counts: P's error itself, or the share of held-out predictions whose error is smaller."""
+    """Unit of delta: P's error itself, or the share of held-out predictions whose error is smaller."""
     steps: Natural = 2000
-    """Gradient steps; 0 leaves the option model as random as it was drawn."""
+    """Gradient steps; 0 leaves the option model random."""
     batch_size: int = 128
     """Windows per gradient step."""
     learning_rate: float = 3e-3
@@ -171,16 +171,16 @@ class OptionsConfig:
     until: Share = 1.0
     """Share of the experience before the last window."""
     parts: int = 1
-    """Equal parts of that span, of each of which select takes its share: 3 mixes early, middle and late."""
+    """Equal parts of that span; select takes its share of each: 3 mixes early, middle and late."""
     select: Literal["random", "top"] = "top"
-    """Which of these windows to learn from: all, or those that collected most reward."""
+    """Windows to learn from: all of these, or those with the greatest reward."""
     fraction: Annotated[float, Bounds(TINY, 1)] = 0.5
-    """Share of the windows that select top keeps."""
+    """Share of the windows that select top takes."""
     views: Literal["one", "all"] = "one"
-    """See each window as it was, or as from any of the body's equal sides: the ant has four."""
+    """Views of a window: the recorded one, or those of all the body's equal sides: the ant has four."""
     state_noise: float = 0.0
-    """Standard deviation of noise on the state that a closed-loop D learns from, so that it heeds the code; where each
-    entry of the state has unit variance."""
+    """Standard deviation of noise on the state that a closed-loop D learns from, so that it depends on the code; the
+    unit is each entry's own standard deviation."""
 
 
 @dataclass(frozen=True)
@@ -188,15 +188,15 @@ class FineTuneConfig:
     """Fine-tuning of D by PPO on its actions, in turns with the policy over options; off unless epochs is set."""
 
     epochs: Natural = 0
-    """Passes over the ticks of each iteration that update D; 0 leaves D as it was learnt."""
+    """Passes over the ticks of each iteration that update D; 0 leaves D unchanged."""
     minibatch_size: int = 512
     """Ticks per gradient step of D."""
     learning_rate: float = 5e-4
-    """Step size of Adam for D; it decays as that of the policy does."""
+    """Step size of Adam for D; it decays like the policy's."""
     std: Positive = 0.2
     """Standard deviation of the noise on D's actions while training."""
     kl_weight: float = 0.0
-    """Weight of the divergence from the D that was learnt."""
+    """Weight of the KL divergence from the learnt D."""
 
 
 @dataclass(frozen=True)
@@ -206,15 +206,15 @@ class TrainConfig:
     ticks: int = 1_000_000
     """Budget of interactions per seed."""
     baselines: tuple[Literal["flat", "repeat", "total", "transfer"], ...] = ("flat",)
-    """Flat PPO beside it: on the task alone; each action held for options.length ticks; given the ticks of collect
-    as well; or starting from the flat policy of the run that options.source names."""
+    """Flat PPO beside it: on the task alone; with each action held for options.length ticks; with the ticks of collect
+    as well; or from the flat policy of the run that options.source names."""
     ppo: PPOConfig = PPOConfig(log_std_init=0.0)
     fine_tune: FineTuneConfig = FineTuneConfig()
 
 
 @dataclass(frozen=True)
 class EvaluateConfig:
-    """Stage evaluate: what the trained policies do without exploration."""
+    """Stage evaluate: the trained policies, with and without exploration."""
 
     episodes: int = 10
     """Episodes per seed."""
@@ -224,7 +224,7 @@ class EvaluateConfig:
 
 @dataclass(frozen=True)
 class Config:
-    """One experiment: a run is a pure function of this and a key."""
+    """One experiment: a run is a pure function of its config and a key."""
 
     env: EnvConfig = EnvConfig()
     collect: CollectConfig = CollectConfig()
@@ -232,7 +232,7 @@ class Config:
     train: TrainConfig = TrainConfig()
     evaluate: EvaluateConfig = EvaluateConfig()
     seed: Annotated[int, Bounds(0, 2**31 - 1)] = 0
-    """Seed of the PRNG key that everything random comes from."""
+    """Seed of the PRNG key, the source of all randomness."""
     seeds: int = 1
     """Independent repeats, trained side by side in one program."""
 
@@ -255,12 +255,12 @@ METHOD_LABELS = {
 
 
 def experience_ticks(config: CollectConfig) -> int:
-    """Return how many ticks of experience stage collect leaves, per seed, but for the rest of an iteration."""
+    """Return the ticks of experience that stage collect leaves per seed, up to the rest of an iteration."""
     return min(config.capacity or config.ticks, config.ticks)
 
 
 def needs_collect(config: Config) -> bool:
-    """Return whether anything uses what stage collect makes."""
+    """Return whether another stage, or a baseline, uses the results of stage collect."""
     learns = not config.options.source and (not config.options.experience or COLLECT in config.options.experience)
     return learns or ("flat" in config.train.baselines and collector_is_baseline(config))
 
@@ -290,6 +290,6 @@ def field_types(group: Any = Config, prefix: str = "", *, bounds: bool = False) 
 
 
 def replace(config: Any, name: str, value: Any) -> Any:
-    """Replace the field of this dotted name."""
+    """Return the config with another value in the field of this dotted name."""
     first, _, rest = name.partition(".")
     return dataclasses.replace(config, **{first: replace(getattr(config, first), rest, value) if rest else value})

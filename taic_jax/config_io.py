@@ -16,7 +16,7 @@ from taic_jax.config import USUAL_BOUNDS, Config, ConfigError, field_types, impo
 
 _PRESETS = resources.files("taic_jax.experiments") / "presets"
 BASE = "base"
-"""Key of a file that names what it starts from, a preset or another file; without it, the defaults."""
+"""Key of a file for its base, a preset or another file; without it, the base is the defaults."""
 SYNONYMS = {
     "env": "env.name", "env_id": "env.name", "task": "env.name", "lr": "train.ppo.learning_rate",
     "discount": "train.ppo.gamma", "gae_lambda": "train.ppo.lambda_", "lam": "train.ppo.lambda_",
@@ -25,7 +25,7 @@ SYNONYMS = {
     "n_epochs": "train.ppo.epochs", "num_steps": "train.ppo.rollout_length", "total_timesteps": "train.ticks",
     "timesteps": "train.ticks", "num_seeds": "seeds", "output": "run_dir", "out": "run_dir", "log_dir": "run_dir",
 }  # fmt: skip
-"""Words of other libraries for a field."""
+"""Names of other libraries for a field."""
 
 
 def load_config(source: str | Path, above: tuple[str, ...] = ()) -> Config:
@@ -78,7 +78,7 @@ def preset_names() -> list[str]:
 
 
 def mistyped(name: str, kind: Any, value: Any) -> ConfigError:
-    """Return the error for a value of the wrong type, with the nearest valid value where there is one."""
+    """Return the error for a value of the wrong type, with the nearest valid value if there is one."""
     many = get_origin(kind) is tuple
     item = get_args(kind)[0] if many else kind
     nouns = {int: ("an integer", "integers"), float: ("a number", "numbers"), str: ("text", "texts")}
@@ -103,8 +103,8 @@ def from_text(name: str, kind: Any, text: str) -> Any:
 
 
 def closest(name: str, names: Iterable[str]) -> str | None:
-    """Return the one of the dotted `names` that `name` stands for: by a word that other libraries use, by its end, or
-    by its looks; None where none is like it."""
+    """Return the one of the dotted `names` that `name` stands for: by another library's name, by its last part, or by
+    its spelling; None if none is similar."""
     names, (group, _, end) = list(names), name.rpartition(".")
     synonym = SYNONYMS.get(end, name)
     for candidate in (f"{group}.{synonym.rpartition('.')[2]}", synonym):
@@ -116,20 +116,20 @@ def closest(name: str, names: Iterable[str]) -> str | None:
 
 
 def nearest(name: str, names: Iterable[str], prefix: str = "") -> str:
-    """Return `; the nearest is ...` for the end of a message, empty where nothing is near."""
+    """Return `; the nearest is ...` for the end of a message, empty if no name is similar."""
     match = closest(name, names)
     return f"; the nearest is {prefix}{match}" if match else ""
 
 
 def as_integer(value: float | str) -> int:
-    """Return the integer that is written as a float or with an exponent, 1e6 say, or raise ValueError."""
+    """Return the integer that is written as a float or with an exponent, such as 1e6, or raise ValueError."""
     if not float(value).is_integer():
         raise ValueError(f"{value} is no integer")
     return int(float(value))
 
 
 class _Loader(yaml.SafeLoader):
-    """Refuse a key that stands twice in one mapping, where YAML's usual loader keeps the last in silence."""
+    """A loader that refuses a key twice in one mapping; YAML's usual loader silently keeps the last."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         names = [key.value for key, _ in node.value]
@@ -224,7 +224,7 @@ def _check_bounds(name: str, kind: Any, value: Any) -> None:
 
 
 def _check_limits(config: Config) -> None:
-    """Check the fields whose least or largest value is that of other fields, or a product of them."""
+    """Check the fields whose bounds are other fields, or products of them."""
     values, baselines = dict(walk(config)), config.train.baselines
     collected = "collect.ppo.num_envs * collect.ppo.rollout_length"  # flat PPO is configured by collect.ppo
     trained = "train.ppo.num_envs * train.ppo.rollout_length"

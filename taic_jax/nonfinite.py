@@ -1,4 +1,4 @@
-"""Numbers that are not finite: name the quantity that had them first, and stop the seed that met them alone."""
+"""Numbers that are not finite: name the first quantity that has them, and stop only the seed that has them."""
 
 from collections.abc import Callable
 from typing import Any
@@ -11,15 +11,14 @@ from jaxtyping import Array, Int
 from taic_jax.types import select
 
 QUANTITIES = ("window", "action", "physics", "observation", "reward", "value", "loss", "gradient")
-"""The quantities that are watched; a code is an index into this, or `FINITE`."""
+"""The quantities to check; a code is an index into this, or `FINITE`."""
 FINITE = -1
 
 
 def first_nonfinite(**quantities: Any) -> Int[Array, ""]:
     """Return the code of the first of these trees of arrays with a number that is not finite.
 
-    Args:
-      **quantities: by name, one of `QUANTITIES`, in the order in which they are computed.
+    Pass trees by their names in `QUANTITIES`, in the order of their computation.
     """
     bad = jnp.stack([~_is_finite(tree) for tree in quantities.values()])
     codes = jnp.array([QUANTITIES.index(name) for name in quantities], jnp.int32)
@@ -27,7 +26,7 @@ def first_nonfinite(**quantities: Any) -> Int[Array, ""]:
 
 
 def earliest(codes: Int[Array, " N"]) -> Int[Array, ""]:
-    """Return the first code of a row in time that is not `FINITE`, if any."""
+    """Return the first of N successive codes that is not `FINITE`, if any."""
     return codes[jnp.argmax(codes != FINITE)]
 
 
@@ -37,7 +36,7 @@ def _is_finite(tree: Any) -> Array:
 
 
 class Guarded(struct.PyTreeNode):
-    """The states [K] of a stage, each the last good one of its seed; why seeds stopped, and after how many steps."""
+    """The last good states [K] of a stage, with the code and the number of good steps of each seed."""
 
     state: Any
     code: Array
@@ -50,7 +49,7 @@ def begin(state: Any, code: Int[Array, " K"]) -> Guarded:
 
 
 def guarded(step: Callable[..., tuple[Any, dict, Any]]) -> Callable[..., tuple[Guarded, dict, Any]]:
-    """Return a step over all seeds that leaves a seed where it was once its numbers are not finite.
+    """Return a step over all seeds that keeps a seed at its last state once its numbers are not finite.
 
     Args:
       step: (states [K], ...) -> (states [K], metrics [K] with the codes `nonfinite`, anything).

@@ -62,25 +62,23 @@ def run_pipeline(
     """Run every stage that is not done yet and return the summary, also written to `summary.json`.
 
     Args:
-      config: what to run, for `config.seeds` seeds.
-      run_dir: its folder.
-      points: variants [G] of `config` that differ from it in floats alone, to be run in its place, in one program;
-        what is per seed is then of G K rows, one point after another.
-      shard: what to split over all devices: these rows, or environments.
-      resume: go on with the run in the folder.
-      overwrite: replace it.
+      config: the experiment, for `config.seeds` seeds.
+      run_dir: the run's folder; `resume` continues the run in it, `overwrite` replaces it.
+      points: variants [G] of `config` that differ from it in floats alone and replace it, in one program of G K rows,
+        one point after another.
+      shard: the axis to split over all devices: rows, or environments.
       quiet: show no progress on standard error.
       **settings: the `signals`, `checkpoint_seconds` and `population` of `Run`.
 
     Raises:
-      Interrupted: a signal was received; resume goes on from where it came.
-      RunFolderError: the folder holds another run, or none to resume, or another process is at it.
+      Interrupted: a signal stopped the run; `resume` continues it.
+      RunFolderError: the folder holds another run, or none to resume, or another process uses it.
       ConfigError: the config does not fit the environment, or the devices.
       ArtifactError: another run does not hold what the config takes from it.
     """
     devices = make_devices(shard, config)
     env, source = make_envs(config)
-    model, policy = take_over(config, env, source)  # what is refused is refused before anything is written
+    model, policy = take_over(config, env, source)  # refuses before anything is written
     model, policy = _for_points((model, policy), len(points or (config,)))
     with Run.open(
         config, run_dir, points=points, resume=resume, overwrite=overwrite, quiet=quiet, devices=devices, **settings
@@ -89,7 +87,7 @@ def run_pipeline(
         model = learn(run, source) if model is None else model
         methods = {"taic": train_over_options(run, env, model)}
         for name in config.train.baselines:
-            # Where experience comes from the task itself, the collector is the flat baseline.
+            # If experience comes from the task itself, the collector is the flat baseline.
             done = collector if name == "flat" and collector_is_baseline(config) else None
             methods[name] = done or train_baseline(run, env, name, policy)
     summary = as_summary(run, {name: {"first": x.first, "last": x.last} for name, x in methods.items()})
@@ -117,7 +115,7 @@ def check_run(
 
 
 def make_envs(config: Config) -> tuple[Env, Env]:
-    """Return the task and the environment that experience is collected in.
+    """Return the task and the environment of stage collect.
 
     Raises:
       ConfigError: there is no such environment, or options learnt in one do not fit the other.
@@ -151,12 +149,12 @@ def make_envs(config: Config) -> tuple[Env, Env]:
 def take_over(
     config: Config, env: Env, source: Env
 ) -> tuple[OptionModel | None, tuple[PolicyParams, Statistics] | None]:
-    """Return the option models and flat policies [K] that the config takes from another run, where it does.
+    """Return the option models and flat policies [K] that the config takes from another run, None for neither.
 
-    Seed k takes the k-th, modulo their number. Experience is only checked, by reading one seed's.
+    Seed k takes the k-th, modulo their number. Experience is only checked, by reading that of one seed.
 
     Raises:
-      ArtifactError: nothing is there, or it was made for another body or with another structure.
+      ArtifactError: the source is missing, or has another body or another structure.
     """
     model = policy = None
     if config.options.source:
@@ -172,7 +170,7 @@ def take_over(
 
 
 def _for_points(tree: Any, count: int) -> Any:
-    """Repeat what is per seed for every point."""
+    """Repeat a tree over seeds for every point."""
     return tree if count == 1 else jax.tree.map(lambda x: jnp.concatenate([x] * count), tree)
 
 
@@ -187,7 +185,7 @@ def _train(
 ) -> Trained:
     """Train one policy per seed and evaluate it before and after.
 
-    A policy that begins from another's explores afresh: the standard deviation is the config's.
+    A policy that begins from another one still explores anew, with the config's standard deviation.
     """
     trainer, keys = make_trainer(stage, run.config, env, model), run.stage_keys(stage)
     state = jax.jit(init_rows)(trainer, keys)
@@ -215,7 +213,7 @@ def _train(
 
 
 def _compile_rows(run: Run, stage: str, function: Callable[..., Any], *args: Any) -> Callable[..., Any]:
-    """Compile a function of rows, and return it as one that places its arguments and returns the run's own rows."""
+    """Return a compiled function of rows that places its arguments and returns the run's own rows."""
     compiled = run.compile(stage, function, *run.devices.place(args))
     return lambda *args: run.rows(compiled(*run.devices.place(args)))
 
@@ -226,7 +224,7 @@ def _without_stopped(results: Any, stopped: np.ndarray) -> Any:
 
 
 def collect(run: Run, env: Env) -> Trained:
-    """Train flat PPO, keep its trajectories as experience, and save the policy as the artifact `policy`."""
+    """Train flat PPO, save its ticks as experience, and the policy as the artifact `policy`."""
     config = run.config.collect
     if experience_ticks(config) < config.ticks:
         run.logger.say(f"collect: of {config.ticks:,} ticks the newest {experience_ticks(config):,} are kept")
@@ -240,7 +238,7 @@ def learn(run: Run, env: Env) -> OptionModel:
     """Learn one option model per seed from the experience and save it as the artifact `options`."""
     config, dataset = run.config.options, select_windows(run, env)
     state = jax.jit(partial(init_learning, env))(config, run.stage_keys("learn"))
-    if config.steps:  # with none, D stays as random as it was drawn
+    if config.steps:  # without steps D stays random
         unit = steps_per_log(config)
         state = drive(run, "learn", learn_rows, state, config, dataset, num_steps=config.steps // unit, unit=unit)
     model = learning.as_model(state, dataset)
@@ -249,11 +247,11 @@ def learn(run: Run, env: Env) -> OptionModel:
 
 
 def select_windows(run: Run, env: Env) -> Dataset:
-    """Return what each seed learns options from.
+    """Return the windows that each seed learns options from.
 
     Raises:
       ArtifactError: there is no experience, or it is of another body.
-      ConfigError: it holds no window of the kind that the config asks for.
+      ConfigError: it holds no window that fits the config.
     """
     config, rows, seeds = run.config.options, len(run.keys), run.config.seeds
     names = config.experience or (COLLECT,)

@@ -1,4 +1,4 @@
-"""Show again how numbers stopped being finite: take the one step that failed from the state that was dumped."""
+"""Replay of a failed step, from the dumped state, to name the first number that is not finite."""
 
 from functools import partial
 from pathlib import Path
@@ -24,19 +24,19 @@ FIELDS = ("stage", "seed", "seeds", "step", "after", "quantity")
 
 
 def replay(dump: Path) -> str | None:
-    """Take the step after which a seed had stopped again, and say what was not finite; None if all was finite now.
+    """Repeat the step at which a seed stopped; return a line on the first number that is not finite, or None.
 
     Args:
-      dump: a folder under `dumps` of a run, which must still be where it was.
+      dump: a folder under `dumps` of a run, still in its place.
 
     Raises:
-      ArtifactError: it is none, or not of this version's kind.
+      ArtifactError: it is not a dump, or was written by another version.
     """
     dumped = _read(dump)
     run_dir = dump.absolute().parents[1]
     config = RunFolder(run_dir).config()
     env, source = make_envs(config)
-    # As many seeds as there were, all in this state and of this point: the program is the one that failed.
+    # With as many seeds as the run, all in this state and of this point, the program is the one that failed.
     point = load_tree(dump / "config", jax.eval_shape(as_arrays, config))
     with Run.view(replace(config, "seeds", dumped["seeds"]), run_dir, point) as run:
         step, like, args = _stage(run, env, source, dumped["stage"])
@@ -70,7 +70,7 @@ def _read(dump: Path) -> dict[str, Any]:
 
 
 def _first_bad(experience: Any, seed: int) -> str:
-    """Return the first tick and environment whose numbers are not finite, if experience was recorded."""
+    """Return the first tick and environment with a number that is not finite, if the step recorded experience."""
     for array in jax.tree.leaves(experience):
         values = np.asarray(array[seed], np.float32)
         bad = np.argwhere(~np.isfinite(values))

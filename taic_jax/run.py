@@ -22,13 +22,13 @@ class Command(command_line.Command):
     """Collect experience, learn options from it, train a policy that chooses among them, and evaluate."""
 
     replay: Annotated[Path | None, tyro.conf.arg(metavar="DUMP")] = None
-    """Take the step again at which a seed stopped, from the state that the run left under dumps, and stop."""
+    """Repeat the step at which a seed stopped, from the state that the run saved under dumps, and stop."""
     hosts: int = 1
-    """Hosts of one run; each runs this command, all with the same folder, which the first writes."""
+    """Hosts of one run; each runs this command with the same folder, which the first host writes."""
     host: int = 0
-    """Which of the hosts this is."""
+    """Index of this host."""
     coordinator: Annotated[str, tyro.conf.arg(metavar="HOST:PORT")] = ""
-    """Where the other hosts reach the first one: any free port of it."""
+    """Address of the first host, with any free port of it."""
 
 
 def main(args: Sequence[str] | None = None) -> int:

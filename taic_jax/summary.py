@@ -28,7 +28,7 @@ MIB = 2**20
 
 
 def plan(config: Config, env: Env, source: Env) -> str:
-    """Return what a run will cost: interactions and memory, one line a stage."""
+    """Return the cost of a run: interactions and memory, one line per stage."""
     collect, options, train = config.collect, config.options, config.train
     rows = [("collect", source, collect.ppo, collect.ticks)] if needs_collect(config) else []
     rows.append(("train", env, train.ppo, train.ticks))
@@ -57,11 +57,9 @@ def plan(config: Config, env: Env, source: Env) -> str:
 
 
 def as_summary(run: Run, methods: Mapping[str, Mapping[str, Any]]) -> Summary:
-    """Return the contents of `summary.json`.
+    """Return the contents of `summary.json`, from a run after its last stage.
 
-    Args:
-      run: after its last stage.
-      methods: by name, the evaluations `first` and `last` of `pipeline.Trained`.
+    `methods` are, by name, the evaluations `first` and `last` of `trainer.Trained`.
     """
     clock = run.clock
     return {
@@ -76,7 +74,7 @@ def as_summary(run: Run, methods: Mapping[str, Mapping[str, Any]]) -> Summary:
 
 
 def as_table(summary: Summary) -> Table:
-    """Return the returns of a summary, a row a method: interquartile means over seeds, and their 95 % intervals."""
+    """Return a table of the returns of each method: interquartile means over seeds, and their 95 % intervals."""
     table = Table("method", box=SIMPLE, title="return of an episode", title_justify="left", title_style="")
     for column in ("untrained", "trained, as it explores", "its mean options or actions"):
         table.add_column(column, justify="right")
@@ -88,7 +86,7 @@ def as_table(summary: Summary) -> Table:
 
 
 def _interval(statistics: Mapping[str, Any]) -> str:
-    """Return an interquartile mean with its interval, where several seeds have one."""
+    """Return an interquartile mean with its interval, if several seeds have one."""
     if statistics["iqm"] is None:
         return "a seed diverged"
     low, high = statistics["ci95"]
@@ -96,7 +94,7 @@ def _interval(statistics: Mapping[str, Any]) -> str:
 
 
 def _stopped(seeds: Stopped) -> dict[str, dict[str, Any]]:
-    """Return, for each seed that stopped in a stage, why and after how many ticks or gradient steps."""
+    """Return the cause of each seed that stopped in a stage, and its ticks or gradient steps before."""
     return {
         str(seed): {"quantity": QUANTITIES[seeds.code[seed]], "after": int(seeds.after[seed])}
         for seed in np.flatnonzero(seeds.code != FINITE)
@@ -104,7 +102,7 @@ def _stopped(seeds: Stopped) -> dict[str, dict[str, Any]]:
 
 
 def _method(first: Mapping[str, Mapping], last: Mapping[str, Mapping]) -> Method:
-    """Summarise every evaluated quantity over seeds; `return` is of the policy as it explores."""
+    """Summarise every evaluated quantity over seeds; `return` is with exploration."""
     result: Any = {}
     for mode in last:
         result[mode] = summarize(last[mode]["return"])
@@ -117,7 +115,7 @@ def _method(first: Mapping[str, Mapping], last: Mapping[str, Mapping]) -> Method
 
 
 def _durations(counts: np.ndarray) -> dict[str, Any]:
-    """Summarise how many options [K, L] took 1..L ticks: the mean per seed, and the share of each over all seeds."""
+    """Summarise the counts [K, L] of options of 1..L ticks: the mean per seed, and the shares over all seeds."""
     ticks = np.arange(1, counts.shape[1] + 1)
     means = counts @ ticks / counts.sum(axis=1)
     return {**summarize(means), "histogram": json_safe(counts.sum(axis=0) / counts.sum())}
@@ -134,7 +132,7 @@ def _version(name: str) -> str | None:
 def commit() -> str | None:
     """Return the git commit of the checkout this package runs from, with `-dirty` if the package was changed, or None.
 
-    Other files of the checkout, as tables that runs are written to, change nothing of what runs.
+    Changes of other files of the checkout, such as tables of results, do not affect a run.
     """
     git = ["git", "-C", str(Path(__file__).parent)]
     commands = [*git, "rev-parse", "HEAD"], [*git, "status", "--porcelain", "--untracked-files=no", "."]

@@ -24,7 +24,7 @@ STEPS_PER_LOG = 100
 
 
 class Trainer(struct.PyTreeNode):
-    """Flat PPO, configured by `collect.ppo`; options are actions, each repeated for `hold` ticks."""
+    """Flat PPO, configured by `collect.ppo`; options are actions, each applied for `hold` ticks."""
 
     config: Config
     model: OptionModel | None = None
@@ -62,7 +62,7 @@ class Trainer(struct.PyTreeNode):
         return state, metrics, as_experience(ticks, self.env.proprioceptive_size)
 
     def assess(self, key: Array, state: Any) -> dict[str, dict[str, Array]]:
-        """Evaluate the policy as it explores, and taking its mean options."""
+        """Evaluate the policy with exploration, and with its mean options."""
         both = partial(evaluate, self.env, self.agent(state), key, self.config.evaluate.episodes)
         results = jax.vmap(both)(jnp.array([1.0, 0.0]))
         modes = ("return", "return_mean_option")
@@ -139,13 +139,13 @@ def init_learning(env: Env, config: OptionsConfig, keys: Array) -> LearnState:
 
 
 def learn_rows(states: LearnState, config: OptionsConfig, dataset: Dataset) -> tuple[LearnState, dict, None]:
-    """Take the gradient steps between two rows of the log, of every row."""
+    """Take the gradient steps between two log lines, of every row."""
     unit = steps_per_log(config)
     return jax.vmap(lambda state, config, data: learning.steps(config, unit, state, data))(states, config, dataset)
 
 
 def steps_per_log(config: OptionsConfig) -> int:
-    """Return how many gradient steps make one step of stage learn, so that whole ones make them all."""
+    """Return the gradient steps of one step of stage learn, a divisor of their total."""
     return max(n for n in range(1, STEPS_PER_LOG + 1) if config.steps % n == 0)
 
 

@@ -17,7 +17,7 @@ from taic_jax import config
 
 Tree = TypeVar("Tree")
 Scalar = Float[Array, ""] | float
-"""A leaf of the config: a float as it is read, an array once `as_arrays` was applied or a sweep vmaps it."""
+"""A leaf of the config: a float from a file, an array after `as_arrays` or in a sweep."""
 
 
 def _register(cls: type) -> None:

@@ -12,13 +12,13 @@ from taic_jax.config import OptionsConfig
 from taic_jax.envs.views import Views, one_view
 from taic_jax.options.model import Scale
 
-# Every tenth stretch of experience is left out of learning if P's error on unseen windows is needed. A stretch is
-# several windows long, so that few of its windows reach into the others.
+# Every tenth stretch of experience is held out if learning needs P's error on unseen windows. A stretch is several
+# windows long, so that few of its windows overlap with others.
 HELD_OUT_EVERY, STRETCH = 10, 8
 
 
 class ShortExperienceError(ValueError):
-    """The experience is too short to leave a part of it out."""
+    """An experience too short to hold a part out."""
 
 
 class Experience(struct.PyTreeNode):
@@ -41,8 +41,8 @@ class Window(struct.PyTreeNode):
 class Dataset(struct.PyTreeNode):
     """Experience flattened to rows, one environment after another, and the rows at which a selected window starts.
 
-    `starts` has one entry per row. Its first `count` are the windows to learn from, the next `held_out` those that
-    are not learnt from; the rest is void, since the numbers depend on the data and the array's size must not.
+    `starts` has one entry per row. Its first `count` are the windows to learn from, the next `held_out` the held-out
+    windows; the rest is void, because the two numbers depend on the data and the array's size must not.
     """
 
     experience: Experience
@@ -55,9 +55,9 @@ class Dataset(struct.PyTreeNode):
 
 
 def window_score(reward: Float[Array, "T B"], done: Array, length: int) -> tuple[Float[Array, "T B"], Array]:
-    """Return the reward collected over the `length` ticks from each tick, and whether no episode ends in them.
+    """Return the sum of rewards over the `length` ticks from each tick, and whether no episode ends in them.
 
-    The tick at which an episode ends is left out too: the state after it is the next episode's.
+    No window contains the last tick of an episode: the state after it is the next episode's.
     """
     total, crosses = jnp.zeros_like(reward), jnp.zeros_like(done)
     for i in range(length):
@@ -73,15 +73,15 @@ def make_dataset(
     """Select windows of `config.length` ticks and measure the scales over them.
 
     Windows start between the shares `since` and `until` of each experience, a span that is cut into `parts`. Of each
-    part, `select="top"` keeps the `fraction` that collected most reward (§4.2.2), `select="random"` keeps all.
+    part, `select="top"` takes the `fraction` with the greatest reward (§4.2.2), `select="random"` takes all.
 
     Args:
-      experience: one, or several of the same body; selected from each by itself, then merged.
-      config: how to select, and whether all views of the body are learnt from.
-      views: of the body; by default it has one.
+      experience: one, or several of the same body; windows are selected from each separately, then merged.
+      config: the settings of the selection; with `views="all"` the dataset has all views of the body.
+      views: the views of the body; by default one.
 
     Raises:
-      ShortExperienceError: windows are to be held out, and none of the experiences is long enough.
+      ShortExperienceError: windows must be held out, and no experience is long enough.
     """
     sources = [experience] if isinstance(experience, Experience) else list(experience)
     needed = STRETCH * HELD_OUT_EVERY * config.length
@@ -93,7 +93,7 @@ def make_dataset(
     num_parts = len(sources) * config.parts
     columns = [_candidates(source, config, i * config.parts) for i, source in enumerate(sources)]
     score, part, held_out = (jnp.concatenate(column) for column in zip(*columns, strict=True))
-    part = jnp.where(jnp.isfinite(score), part, num_parts)  # where no window may start
+    part = jnp.where(jnp.isfinite(score), part, num_parts)  # rows where no window may start
     order, selected = _select(score, part, num_parts, config)
     group = jnp.where(selected, held_out[order].astype(jnp.int32), 2)
     starts = order[jnp.argsort(group, stable=True)]
@@ -110,12 +110,12 @@ def make_dataset(
 
 
 def holds_out(config: OptionsConfig) -> bool:
-    """Return whether learning needs P's error on windows that it does not learn from."""
+    """Return whether learning needs P's error on held-out windows."""
     return config.termination == "predict" and config.delta_unit == "quantile"
 
 
 def _candidates(experience: Experience, config: OptionsConfig, first_part: int) -> tuple[Array, Array, Array]:
-    """Return for every row the score of the window from there, or NaN, its part, and whether it is held out."""
+    """Return for every row the score of the window that starts there, or NaN, its part, and whether it is held out."""
     num_ticks, num_envs = experience.reward.shape
     score, valid = window_score(experience.reward, experience.done, config.length)
     tick = jnp.arange(num_ticks)
@@ -150,7 +150,7 @@ def _flatten(x: Array) -> Array:
 
 
 def _scale(x: Float[Array, "N P"]) -> Scale:
-    # A constant entry (an arena's never-moving coordinate) must not be blown up.
+    # A constant entry, such as a fixed coordinate of an arena, must not be amplified.
     std = jnp.std(x, axis=0)
     return Scale(jnp.mean(x, axis=0), jnp.where(std < 1e-4, 1.0, std))
 
@@ -164,7 +164,7 @@ def gather(
 ) -> Window:
     """Return the windows at positions `which` of `starts`, of `ticks` <= `length` ticks each; leading axis N.
 
-    Each is seen in its `view`, by default as it was.
+    Each has its `view`, by default the recorded one.
     """
     rows = dataset.starts[which][:, None] + jnp.arange(length + 1)[None]
     mask = jnp.arange(length)[None] < ticks[:, None]

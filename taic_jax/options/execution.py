@@ -1,4 +1,4 @@
-"""Executors turn an option into primitive actions, tick by tick (§3.4)."""
+"""Executors, which turn an option into primitive actions, tick by tick (§3.4)."""
 
 from typing import Any, Protocol, runtime_checkable
 
@@ -14,7 +14,7 @@ from taic_jax.options.termination import Termination, make_termination
 
 @runtime_checkable
 class Executor(Protocol):
-    """Run one option, unbatched: the caller vmaps, and ends every option after at most `length` ticks."""
+    """The execution of one option, unbatched: the caller vmaps, and ends options after at most `length` ticks."""
 
     @property
     def option_size(self) -> int:
@@ -23,7 +23,7 @@ class Executor(Protocol):
 
     @property
     def length(self) -> int:
-        """L, the most ticks an option takes."""
+        """L, the most ticks of an option."""
         ...
 
     @property
@@ -40,7 +40,7 @@ class Executor(Protocol):
         ...
 
     def ended(self, carry: Any, obs: Float[Array, " S"], noise: Float[Array, " X"]) -> Bool[Array, ""]:
-        """Return beta(s, o) for the observation after the tick, true where the option ends before `length`."""
+        """Return beta(s, o) for the observation after the tick, true if the option ends before `length`."""
         ...
 
 
@@ -73,7 +73,7 @@ class Decoding(struct.PyTreeNode):
 
 
 class OptionExecutor(struct.PyTreeNode):
-    """D, and the termination rule that ends what D does."""
+    """D under a termination rule."""
 
     model: OptionModel
     termination: Termination = struct.field(pytree_node=False)
@@ -109,7 +109,7 @@ class OptionExecutor(struct.PyTreeNode):
         return self.termination.ended(self.model, carry.memory, self._state(obs), noise)
 
     def _state(self, obs: Float[Array, " S"]) -> Float[Array, " P"]:
-        """Return the proprioceptive slice: an observation may have more entries than the model knows."""
+        """Return the proprioceptive slice: an observation may have more entries than the model reads."""
         return obs[: self.model.state_size]
 
     def _decoder(self, *args: Any, method: str) -> Any:
@@ -119,7 +119,7 @@ class OptionExecutor(struct.PyTreeNode):
 def make_executor(config: OptionsConfig, model: OptionModel) -> OptionExecutor:
     """Return the executor of an option model under the config's termination rule.
 
-    Where delta is P's error itself, the config's is taken, so that it can be swept over one model.
+    If delta is P's error itself, the config's replaces the model's, so that a sweep of delta can use one model.
     """
     if config.delta_unit == "error":
         model = model.replace(delta=jnp.asarray(config.delta, jnp.float32))

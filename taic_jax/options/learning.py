@@ -1,4 +1,4 @@
-"""Learning options from windows: E, D, P and F jointly (§3.2-3.4, Algorithm 1)."""
+"""Option learning from windows: E, D, P and F jointly (§3.2-3.4, Algorithm 1)."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -20,7 +20,7 @@ from taic_jax.options.termination import prefix_errors, stop_index
 from taic_jax.types import Scalar, as_arrays
 
 DELTA_MEMORY = 100.0
-"""Steps over which a threshold that is a quantile is averaged."""
+"""Steps over which a quantile threshold is averaged."""
 
 
 class LearnState(struct.PyTreeNode):
@@ -57,14 +57,14 @@ def init(config: OptionsConfig, networks: Networks, key: Key[Array, ""]) -> Lear
 def window_losses(
     model: OptionModel, config: OptionsConfig, window: Window, noise: Array, disturbance: Array | float = 0.0
 ) -> dict[str, Array]:
-    """Return the losses of one window and its duration, `noise` [D] drawing every o_i from q(o|a_0..a_i).
+    """Return the losses of one window and its duration; `noise` [D] draws every o_i from q(o|a_0..a_i).
 
-    The normalised states that D reads are off by `disturbance` [L, P].
+    `disturbance` [L, P] is added to the normalised states that D reads.
 
-    The sum E descends is L_recons + lambda_kl L_KL + lambda_pred L_pred - lambda_adv L_adv (and, where D emits an
+    E descends the sum L_recons + lambda_kl L_KL + lambda_pred L_pred - lambda_adv L_adv (and, where D emits an
     end signal, lambda_end times its loss), and F descends L_adv: the reversal in front of F changes the sign on its
     way into E and nowhere else. Under termination predict the window is cut where Algorithm 1 stops, and L_pred is
-    the sum over the prefixes up to there; else it is of the whole window.
+    the sum over the prefixes up to there; otherwise L_pred is of the whole window.
     """
     means, log_stds = model.encode(window.actions)
     last = jnp.sum(window.mask, dtype=jnp.int32) - 1
@@ -95,7 +95,7 @@ def window_losses(
 def total_loss(
     params: dict, model: OptionModel, config: OptionsConfig, windows: Window, *noise: Array
 ) -> tuple[Float[Array, ""], dict[str, Array]]:
-    """Return the weighted sum over N windows and the mean of each loss; `noise` is the codes', then the states'."""
+    """Return the weighted sum and the mean of each loss over N windows; `noise` is for codes, then for states."""
     one = partial(window_losses, model.replace(params=params), config)
     losses = jax.tree.map(jnp.mean, jax.vmap(one)(windows, *noise))
     total = (
@@ -116,7 +116,7 @@ def step(config: OptionsConfig, dataset: Dataset, state: LearnState) -> tuple[Le
     windows = _draw(config, dataset, key_windows, jnp.zeros((), jnp.int32), dataset.count)
     noise = [jax.random.normal(key_option, (config.batch_size, config.size))]
     if config.decoder == "closed":
-        key_states = jax.random.fold_in(key_option, 1)  # apart, so that a decoder in open loop draws the same
+        key_states = jax.random.fold_in(key_option, 1)  # separate, so that an open-loop decoder draws the same
         noise.append(config.state_noise * jax.random.normal(key_states, windows.states[:, :-1].shape))
     model = as_model(state, dataset)
     gradient, losses = jax.grad(total_loss, has_aux=True)(state.params, model, config, windows, *noise)
@@ -147,7 +147,7 @@ def _draw(
 def _measure_delta(config: OptionsConfig, dataset: Dataset, state: LearnState, key: Key[Array, ""]) -> Float[Array, ""]:
     """Return the quantile `config.delta` of P's errors on held-out windows, averaged over the latest steps.
 
-    Without any such window it is NaN, which no error reaches.
+    Without held-out windows it is NaN, which no error reaches.
     """
     windows = _draw(config, dataset, key, dataset.count, dataset.held_out)
     model = as_model(state, dataset)
@@ -179,11 +179,11 @@ def learn(
     """Learn an option model from experience [T, B, ...]; pure, so experiences and keys may be vmapped.
 
     Several experiences, of tasks that share the body, are merged. Returns the model and the losses of every step,
-    leading axis the step. With `config.views` all, windows are learnt from in all `views` of the body (`Env.views`).
+    leading axis the step. With `config.views` all, windows have all `views` of the body (`Env.views`).
 
     Raises:
-      ShortExperienceError: delta is a quantile, and there is no experience long enough to hold a part of it out.
-      ValueError: all views are asked for, and none given.
+      ShortExperienceError: delta is a quantile, and no experience is long enough to hold a part out.
+      ValueError: `config.views` is all, and `views` is missing.
     """
     if config.views == "all" and views is None:
         raise ValueError("options.views: all needs the views of the body, as in learn(..., views=env.views); got none")

@@ -14,13 +14,13 @@ from taic_jax.types import Scalar
 def reconstruction_loss(
     decoded: Float[Array, "L A"], actions: Float[Array, "L A"], mask: Bool[Array, " L"]
 ) -> Float[Array, ""]:
-    """L_Recons (eq. 3): mean squared error over the window's own actions."""
+    """Return L_Recons (eq. 3): the mean squared error over the window's own actions."""
     errors = jnp.mean(jnp.square(decoded - actions), axis=-1)
     return jnp.sum(jnp.where(mask, errors, 0.0)) / jnp.sum(mask, dtype=jnp.float32)
 
 
 def kl_loss(mean: Float[Array, " D"], log_std: Float[Array, " D"]) -> Float[Array, ""]:
-    """L_KL (eq. 2): KL(q(o|a) || N(0, I)) in nats."""
+    """Return L_KL (eq. 2): KL(q(o|a) || N(0, I)) in nats."""
     posterior = distrax.MultivariateNormalDiag(mean, jnp.exp(log_std))
     prior = distrax.MultivariateNormalDiag(jnp.zeros_like(mean), jnp.ones_like(mean))
     kl: Any = posterior.kl_divergence(prior)
@@ -28,19 +28,19 @@ def kl_loss(mean: Float[Array, " D"], log_std: Float[Array, " D"]) -> Float[Arra
 
 
 def prediction_loss(predicted: Float[Array, " P"], change: Float[Array, " P"]) -> Float[Array, ""]:
-    """L_pred (eq. 8): mean squared error of the normalised state change."""
+    """Return L_pred (eq. 8): the mean squared error of the normalised state change."""
     return jnp.mean(jnp.square(predicted - change))
 
 
 def adversarial_loss(
     estimated: Float[Array, "2 P"], start: Float[Array, " P"], end: Float[Array, " P"]
 ) -> Float[Array, ""]:
-    """L_adv (eq. 9): F's mean squared error on normalised start and end state."""
+    """Return L_adv (eq. 9): F's mean squared error on normalised start and end state."""
     return jnp.mean(jnp.square(estimated - jnp.stack([start, end])))
 
 
 def end_loss(end_logit: Float[Array, " L"], mask: Bool[Array, " L"]) -> Float[Array, ""]:
-    """Cross-entropy of the end signal c_t (§3.4.2): yes at the window's last action, no at those before it."""
+    """Return the cross-entropy of the end signal c_t (§3.4.2): yes at the window's last action, no before it."""
     is_last = mask & ~jnp.append(mask[1:], False)
     errors = optax.sigmoid_binary_cross_entropy(end_logit, is_last.astype(jnp.float32))
     return jnp.sum(jnp.where(mask, errors, 0.0)) / jnp.sum(mask, dtype=jnp.float32)

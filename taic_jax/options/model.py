@@ -16,7 +16,7 @@ Carry = tuple[Array, Array]
 
 
 def _lstm_cell(hidden_size: int) -> nn.OptimizedLSTMCell:
-    # Flax's default is orthogonal, by QR: see `networks.MLP` for why there must be none.
+    # Flax's default is orthogonal, by QR, which can deadlock: see `networks.MLP`.
     return nn.OptimizedLSTMCell(hidden_size, recurrent_kernel_init=nn.initializers.lecun_normal())
 
 
@@ -52,7 +52,7 @@ class Encoder(nn.Module):
 
 
 class OpenDecoder(nn.Module):
-    """D in open loop: o -> actions and end logits, one tick at a time, never looking at the state (§3.2)."""
+    """D in open loop: o -> actions and end logits, one tick at a time, without the state (§3.2)."""
 
     action_size: int
     hidden_size: int
@@ -87,7 +87,7 @@ class OpenDecoder(nn.Module):
     def at(
         self, option: Float[Array, " D"], state: Float[Array, " P"], tick: Int[Array, ""], length: int
     ) -> Float[Array, " A"]:
-        """Return the `tick`-th action of `length`, counted from 0; whatever the state."""
+        """Return the `tick`-th action of `length`, counted from 0, in any state."""
         return self(option, jnp.broadcast_to(state, (length, *state.shape)))[0][tick]
 
 
@@ -105,7 +105,7 @@ class ClosedDecoder(nn.Module):
         self.mlp = MLP((*self.hidden_sizes, self.action_size + 1))
 
     def start(self, option: Float[Array, " D"]) -> Float[Array, ""]:
-        """Return the share of ticks run: none."""
+        """Return the share of past ticks: none."""
         return jnp.zeros(())
 
     def step(
@@ -164,7 +164,7 @@ class Networks(NamedTuple):
 
 
 class Scale(struct.PyTreeNode):
-    """Mean and standard deviation [P] over the experience an option model was learnt from."""
+    """Mean and standard deviation [P] over the experience of an option model."""
 
     mean: Array
     std: Array
@@ -199,7 +199,7 @@ class OptionModel(struct.PyTreeNode):
     def decode(
         self, option: Float[Array, " D"], states: Float[Array, "L P"]
     ) -> tuple[Float[Array, "L A"], Float[Array, " L"]]:
-        """Return D's actions and end logits at normalised states, which a D in open loop only counts."""
+        """Return D's actions and end logits at normalised states; an open-loop D uses only their number."""
         return apply(self.networks.decoder, self.params["decoder"], option, states)
 
     def predict(self, state: Float[Array, " P"], option: Float[Array, " D"]) -> Float[Array, " P"]:

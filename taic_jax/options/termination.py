@@ -1,4 +1,4 @@
-"""Termination rules beta(s, o): when a running option ends before the longest it may take (§3.4).
+"""Termination rules beta(s, o), which end a running option before its greatest length (§3.4).
 
 The executor asks its rule after every tick. `memory` is the state that a rule carries for the running option.
 """
@@ -22,7 +22,7 @@ from taic_jax.types import Scalar
 def stop_index(errors: Float[Array, " L"], delta: Scalar) -> Int[Array, ""]:
     """Return the index of the action at which Algorithm 1 stops a window: the first whose error reaches delta.
 
-    That action still belongs to the option. Where no error reaches delta it is the last one.
+    That action still belongs to the option. If no error reaches delta it is the last one.
     """
     surprised = errors >= delta
     return jnp.where(jnp.any(surprised), jnp.argmax(surprised), len(errors) - 1).astype(jnp.int32)
@@ -39,7 +39,7 @@ def prefix_errors(
 
 @runtime_checkable
 class Termination(Protocol):
-    """Decide whether an option ends, unbatched; `noise` [X], standard normal, is its chance."""
+    """A rule that ends an option, unbatched, with standard normal `noise` [X]."""
 
     @property
     def noise_size(self) -> int:
@@ -78,9 +78,9 @@ class Fixed:
 
 @dataclass(frozen=True)
 class Output:
-    """Term-output (§3.4.2): D's end signal ends the option; the memory is its last logit.
+    """Term-output (§3.4.2): D's end signal ends the option; the memory is the latest logit.
 
-    With `noise_size` 1 the signal is a probability that the noise draws from; with 0 it is yes above one half.
+    With `noise_size` 1 the signal is a probability, and the noise draws from it; with 0 it is yes above one half.
     """
 
     noise_size: int
@@ -96,14 +96,14 @@ class Output:
         return end_logit
 
     def ended(self, model: OptionModel, memory: Array, state: Float[Array, " P"], noise: Array) -> Bool[Array, ""]:
-        """End with the signal's probability, or where it is above one half."""
+        """End with the signal's probability, or if it is above one half."""
         if not self.noise_size:
             return memory > 0.0
         return jax.scipy.special.ndtr(noise[0]) < jax.nn.sigmoid(memory)
 
 
 class Following(struct.PyTreeNode):
-    """Memory of termination predict: the option's first state, E's carry, and the option E reads so far."""
+    """Memory of termination predict: the option's first state, E's carry, and E's code of the actions so far."""
 
     start: Array
     carry: Carry
@@ -117,7 +117,7 @@ class Predict:
     noise_size: int = 0
 
     def start(self, model: OptionModel, state: Float[Array, " P"]) -> Following:
-        """Remember the state the option began in."""
+        """Remember the option's first state."""
         return Following(state, model.networks.encoder.start(), jnp.zeros(model.networks.encoder.option_size))
 
     def follow(self, model: OptionModel, memory: Following, action: Float[Array, " A"], end_logit: Array) -> Following:
@@ -127,7 +127,7 @@ class Predict:
         return memory.replace(carry=carry, option=option)
 
     def ended(self, model: OptionModel, memory: Following, state: Float[Array, " P"], noise: Array) -> Bool[Array, ""]:
-        """End where the error of P(s_0, o_i) on the state reached is at least delta."""
+        """End if the error of P(s_0, o_i) on the state after the tick is at least delta."""
         states = jnp.stack([memory.start, state])
         return prefix_errors(model, memory.option[None], states)[0] >= model.delta
 

@@ -1,8 +1,8 @@
 """Fine-tuning D: PPO on primitive actions through the decoder, in turns with the policy over options (§5).
 
-D's actions are drawn around its output, so that they have a likelihood that PPO's gradient can reach D by. From the
-same ticks first the policy learns which option to choose, then D what to do in it; E, P and F stay as they are. A KL
-term may hold D near the one that was learnt.
+D's actions are drawn around its output, so that PPO has the gradient of their likelihood. From the same ticks first the
+policy learns which option to choose, then D learns its actions; E, P and F do not change. A KL term can hold D near the
+learnt one.
 """
 
 from functools import partial
@@ -47,7 +47,7 @@ class NoisyExecutor(struct.PyTreeNode):
 
     @property
     def length(self) -> int:
-        """L, the most ticks an option takes."""
+        """L, the most ticks of an option."""
         return self.inner.length
 
     @property
@@ -69,7 +69,7 @@ class NoisyExecutor(struct.PyTreeNode):
 
 
 class Actions(struct.PyTreeNode):
-    """R ticks as D's loss reads them: D's inputs, the action before clipping, its likelihood and its advantage."""
+    """R ticks, the input of D's loss: D's inputs, the action before clipping, its likelihood and its advantage."""
 
     option: Array
     state: Array
@@ -80,7 +80,7 @@ class Actions(struct.PyTreeNode):
 
 
 def init(config: PPOConfig, executor: OptionExecutor) -> Tuned:
-    """Return the learnt D, and an optimiser that has done nothing yet."""
+    """Return the learnt D, and a fresh state of its optimiser."""
     decoder = executor.model.params["decoder"]
     return Tuned(decoder, make_optimizer(config).init(decoder))
 
@@ -91,7 +91,7 @@ def tuned_executor(executor: OptionExecutor, decoder: Any) -> OptionExecutor:
 
 
 def fill_options(option: Float[Array, "T B D"], decision: Bool[Array, "T B"], first: Float[Array, "B D"]) -> Array:
-    """Return the option that ran at each tick [T, B, D]: the last one decided on, or `first` before any was."""
+    """Return the running option of each tick [T, B, D]: that of the last decision, or `first` before the first one."""
 
     def tick(running: Array, step: tuple[Array, Array]) -> tuple[Array, Array]:
         chosen, decides = step
@@ -140,16 +140,8 @@ def iterate(
 ) -> tuple[ppo.TrainState, Tuned, dict[str, Array]]:
     """Run one iteration: one of PPO over options with noise on D's actions, then D's epochs on the same ticks.
 
-    Args:
-      config: of PPO; its `clip`, `gamma`, `lambda_` and `max_grad_norm` are D's too.
-      fine: the rest of D's.
-      env: the task.
-      executor: of the options that were learnt.
-      num_iterations: over which the step sizes decay.
-      state: of the policy.
-      tuned: D so far.
-
-    Returns the next state, D, and the metrics of both.
+    `config` is of PPO; its `clip`, `gamma`, `lambda_` and `max_grad_norm` are D's too, and `fine` has D's other settings.
+    `executor` has the learnt options. Returns the next state, D, and the metrics of both.
     """
     noisy = NoisyExecutor(tuned_executor(executor, tuned.decoder), fine.std)
     after, metrics, ticks, judgement = ppo.iterate(config, env, noisy, num_iterations, state)
@@ -169,10 +161,7 @@ def iterate(
 def _rows(
     config: PPOConfig, noisy: NoisyExecutor, running: Float[Array, "B D"], ticks: Rollout, judgement: Judgement
 ) -> Actions:
-    """Return every tick as a row, with the advantage of its action over what the critic expected.
-
-    `running` are the options at the first tick.
-    """
+    """Return every tick as a row, with the advantage of its action; `running` are the options at the first tick."""
     advantage = semi_markov_advantages(judgement, jnp.ones_like(ticks.ended), config.gamma, config.lambda_)
     model, tick = noisy.inner.model, ticks.duration - 1
     option = fill_options(ticks.option, ticks.decision, running)
@@ -194,7 +183,7 @@ def _epoch(
     tuned: Tuned,
     key: Key[Array, ""],
 ) -> tuple[Tuned, tuple[Array, Array]]:
-    """Pass once over all ticks in random order; a rest that fills no minibatch waits for the next pass."""
+    """Pass once over all ticks in random order, except for a rest that fills no minibatch."""
     count = len(rows.advantage) // fine.minibatch_size
     order = shuffled(jnp.ones(len(rows.advantage), bool), key)[: count * fine.minibatch_size]
     batches = jax.tree.map(lambda x: x[order].reshape((count, fine.minibatch_size, *x.shape[1:])), rows)

@@ -21,15 +21,15 @@ CARRIED = 1000
 
 
 def init(shape: tuple[int, ...] = ()) -> Statistics:
-    """Return statistics of nothing: mean 0, standard deviation 1."""
+    """Return statistics without data: mean 0, standard deviation 1."""
     return running_statistics.init_state(jnp.zeros(shape))
 
 
 def carry_over(statistics: Statistics, shared: int, size: int) -> Statistics:
     """Return statistics of `size` entries of which the first `shared` are those of another run.
 
-    They weigh as much as `CARRIED` observations, so that those of the new task soon outweigh them; the other entries
-    start at mean 0 and standard deviation 1.
+    They count as `CARRIED` observations, so that those of the new task soon outweigh them; the other entries start at
+    mean 0 and standard deviation 1.
     """
     source: Any = statistics
     mean = jnp.zeros(size).at[:shared].set(source.mean[:shared])
@@ -40,7 +40,7 @@ def carry_over(statistics: Statistics, shared: int, size: int) -> Statistics:
 
 
 def update(statistics: Statistics, batch: Float[Array, "..."]) -> Statistics:
-    """Take in a batch whose trailing axes have the statistics' shape."""
+    """Update statistics with a batch whose trailing axes have their shape."""
     # Brax broadcasts the mean over the batch axes implicitly.
     with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
         return running_statistics.update(statistics, batch, validate_shapes=False)
@@ -69,7 +69,7 @@ def init_reward_scale(num_envs: int) -> RewardScale:
 def scale_rewards(
     scale: RewardScale, reward: Float[Array, "T B"], done: Bool[Array, "T B"], gamma: Scalar
 ) -> tuple[RewardScale, Float[Array, "T B"]]:
-    """Divide rewards by the standard deviation of the discounted return, the new ticks taken in first."""
+    """Divide rewards by the standard deviation of the discounted return, the new ticks included."""
 
     def tick(total: Array, step: tuple[Array, Array]) -> tuple[Array, Array]:
         reward_t, done_t = step

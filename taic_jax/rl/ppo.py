@@ -88,7 +88,7 @@ def as_agent(config: PPOConfig, executor: Executor, state: TrainState) -> Agent:
 
 
 def step_size(config: PPOConfig, learning_rate: Scalar, iteration: Int[Array, ""], num_iterations: int) -> Scalar:
-    """Return the step size of an iteration, which decays to zero over all of them where the config says so."""
+    """Return the step size of an iteration, which decays to zero over all of them if the config says so."""
     progress = iteration.astype(jnp.float32) / num_iterations if config.learning_rate_decay else 0.0
     return learning_rate * (1.0 - progress)
 
@@ -102,7 +102,7 @@ def _standardize(x: Float[Array, " R"], mask: Array) -> Float[Array, " R"]:
 def iterate(
     config: PPOConfig, env: Env, executor: Executor, num_iterations: int, state: TrainState
 ) -> tuple[TrainState, dict[str, Array], Rollout, Judgement]:
-    """Run one iteration: collect T ticks of B environments, judge them, then update the policy in epochs.
+    """Run one iteration: collect T ticks of B environments, evaluate them, then update the policy in epochs.
 
     Returns the next state, the iteration's metrics, the rollout (unscaled rewards) and its judgement.
     """
@@ -169,7 +169,7 @@ def improve(
     decision: Bool[Array, " R"],
     key: Key[Array, ""],
 ) -> Update:
-    """Run all epochs of updates on the rows where the policy decided."""
+    """Run all epochs of updates on the ticks that are decisions."""
     if config.normalize_advantage:
         rows = rows.replace(advantage=_standardize(rows.advantage, decision))
     learning_rate = step_size(config, config.learning_rate, state.iteration, num_iterations)
@@ -180,7 +180,7 @@ def improve(
 def _explore_anew(
     config: PPOConfig, params: PolicyParams, before: dict[str, Array], after: dict[str, Array]
 ) -> PolicyParams:
-    """Reset the standard deviation where half of the environments have changed after a rollout, and had not before it.
+    """Reset the standard deviation after the rollout in which the share of changed environments reaches one half.
 
     A task without a metric `changed` never changes.
     """
@@ -196,7 +196,7 @@ def _metrics(config: PPOConfig, state: TrainState, ticks: Rollout, result: Updat
     num_updates = config.epochs * ((count + config.minibatch_size - 1) // config.minibatch_size)
     terms = dict(zip(LOSSES, result.terms / num_updates.astype(jnp.float32), strict=True))
     return {
-        # Of each environment's last finished episode; NaN until one has finished.
+        # The mean over each environment's last finished episode; NaN before the first.
         "return": jnp.nanmean(state.running.last_return),
         "episodes": jnp.sum(ticks.terminated | ticks.truncated, dtype=jnp.int32).astype(jnp.float32),
         "decisions": count.astype(jnp.float32),
@@ -209,14 +209,14 @@ def _metrics(config: PPOConfig, state: TrainState, ticks: Rollout, result: Updat
 
 
 def _pack_metrics(state: State) -> Array:
-    """Return the metrics of a tick as one array, in the order of their names: each array costs the loop time."""
+    """Return the metrics of a tick as one array, in the order of their names: each array slows the loop down."""
     return (
         jnp.stack([state.metrics[name] for name in sorted(state.metrics)], axis=-1) if state.metrics else state.reward
     )
 
 
 def num_iterations(config: PPOConfig, ticks: int) -> int:
-    """Return how many whole iterations a budget of ticks buys."""
+    """Return the number of whole iterations in a budget of ticks."""
     return ticks // (config.num_envs * config.rollout_length)
 
 

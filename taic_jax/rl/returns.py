@@ -9,15 +9,15 @@ from taic_jax.types import Scalar
 
 
 class Judgement(struct.PyTreeNode):
-    """T ticks of B environments as the critic judges them.
+    """Rewards, ends and the critic's values of T ticks of B environments.
 
     Attributes:
-      reward: r_t, as the critic learns it.
+      reward: r_t, in the critic's scale.
       terminated: the task ended after tick t: the bootstrap is zero.
       truncated: the time limit cut the episode after tick t: bootstrap from `final_value`.
       value: V(s_t).
       final_value: V of the observation after tick t, before any reset.
-      last_value: V(s_T) [B], from which an option cut by the end of the rollout bootstraps.
+      last_value: V(s_T) [B], the bootstrap of an option that the end of the rollout cuts.
     """
 
     reward: Array
@@ -33,11 +33,11 @@ def semi_markov_advantages(
 ) -> Float[Array, "T B"]:
     """Return the advantage of deciding at each tick; only entries at decisions are meaningful.
 
-    For a decision at t whose option runs k ticks (eq. 11-13)
+    For a decision at t whose option takes k ticks (eq. 11-13)
 
         delta_t = r_{t..t+k} + gamma^k V(s_{t+k}) - V(s_t),   A_t = delta_t + gamma^k lambda A_{t+k}.
 
-    The scan carries Z_t = A_t + V(s_t): inside an option Z_t = r_t + gamma Z_{t+1}, and where it ends
+    The scan carries Z_t = A_t + V(s_t): inside an option Z_t = r_t + gamma Z_{t+1}, and at its end
     Z_t = r_t + gamma (bootstrap + lambda A_{t+1}). With every option one tick long this is GAE.
 
     Args:

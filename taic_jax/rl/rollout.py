@@ -1,7 +1,7 @@
-"""Options in lockstep ticks: the one rollout of both levels.
+"""Options in lockstep ticks: one rollout of both levels.
 
-Every tick every environment takes one real step. The policy decides on a new option wherever the last one ended; then
-the executor emits the next action; then the termination rule says whether the option ends.
+Every environment takes one real step per tick. The policy decides on a new option in those whose last option ended;
+then the executor emits the next action; then the termination rule decides whether the option ends.
 """
 
 from collections.abc import Callable
@@ -34,10 +34,10 @@ class RolloutCarry(struct.PyTreeNode):
 
 
 class Rollout(struct.PyTreeNode):
-    """T ticks of B environments; `option` and `log_prob` mean something only where `decision`.
+    """T ticks of B environments; `option` and `log_prob` are meaningful only at decisions.
 
-    `duration` counts the ticks that the running option has taken, this one included; `noise` [T, B, Z] is all that was
-    drawn: D numbers of the policy, then those of the executor.
+    `duration` counts the ticks of the running option, this one included; `noise` [T, B, Z] has all random numbers: D
+    for the policy, then those of the executor.
     """
 
     obs: Array
@@ -97,7 +97,7 @@ def nothing(state: State) -> None:
 
 
 def count_durations(ticks: Rollout, length: int, where: Array | bool = True) -> Float[Array, " L"]:
-    """Return how many options ended after 1, 2, ... `length` ticks, among the ticks [T, B] that `where` selects."""
+    """Return the number of options that ended after 1, 2, ... `length` ticks, among ticks [T, B] with `where`."""
     ended = ticks.ended & where
     with jax.numpy_rank_promotion("allow"):
         counts = ended[..., None] & (ticks.duration[..., None] == jnp.arange(1, length + 1))
@@ -117,12 +117,8 @@ def rollout(
 
     Args:
       env: an environment that resets itself (`AutoReset`).
-      executor: turns an option into actions.
-      decide: the policy.
-      running: from `start` or from the previous rollout.
-      key: consumed.
-      length: T.
-      keep: extras to record of the state after each tick (before a reset: reward and metrics only).
+      running: the result of `start` or of the previous rollout.
+      keep: the extras to record of the state after each tick (before a reset: reward and metrics only).
     """
     num_envs = running.ended.shape[0]
     noise = jax.random.normal(key, (length, num_envs, executor.option_size + executor.noise_size))

@@ -1,4 +1,4 @@
-"""PPO's updates: clipped losses of minibatches of decisions, in epochs; no update is spent on other ticks."""
+"""PPO's updates: clipped losses of minibatches of decisions, in epochs; other ticks take no part in them."""
 
 from collections.abc import Callable
 from functools import partial
@@ -19,7 +19,7 @@ LOSSES = ("policy_loss", "value_loss", "entropy", "approx_kl", "clip_fraction")
 
 
 class Decisions(struct.PyTreeNode):
-    """R decisions as the loss reads them."""
+    """R decisions, the input of the loss."""
 
     obs: Array
     option: Array
@@ -97,7 +97,7 @@ def shuffled(chosen: Bool[Array, " R"], key: Key[Array, ""]) -> UInt32[Array, " 
     """Return the rows' indices: the chosen ones first, in random order.
 
     Index and random bits are sorted as one integer, which XLA does four times as fast as it sorts pairs. Rows of
-    equal bits stay in order, which matters only at an edge between minibatches.
+    equal bits keep their order, which matters only at an edge between minibatches.
     """
     width = max(1, (len(chosen) - 1).bit_length())
     index = jnp.arange(len(chosen), dtype=jnp.uint32)
@@ -119,7 +119,7 @@ def _epoch(
     """Pass once over all decisions in random order, in as many minibatches as they fill."""
     count = jnp.sum(decision, dtype=jnp.int32)
     num_minibatches = (count + config.minibatch_size - 1) // config.minibatch_size
-    # The ticks between decisions are never touched.
+    # The ticks between decisions are beyond the last minibatch.
     rows = unpack(jnp.pad(packed[shuffled(decision, key)], ((0, config.minibatch_size), (0, 0))))
     step = partial(_minibatch, policy, config, learning_rate, rows, count, num_minibatches)
     return jax.lax.fori_loop(0, num_minibatches, step, carry), None
