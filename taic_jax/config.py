@@ -143,7 +143,7 @@ class OptionsConfig:
     shortest: int = 1
     """Fewest ticks of the windows that termination output learns from."""
     end_signal: Literal["sampled", "threshold"] = "sampled"
-    """How termination output reads D's end signal: as a probability, or as yes above one half."""
+    """Meaning of D's end signal under termination output: a probability, or yes above one half."""
     delta: Positive = 0.5
     """Threshold on P's error at which termination predict ends an option (Algorithm 1)."""
     delta_unit: Literal["error", "quantile"] = "quantile"

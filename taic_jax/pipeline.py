@@ -74,7 +74,7 @@ def run_pipeline(
       Interrupted: a signal stopped the run; `resume` continues it.
       RunFolderError: the folder holds another run, or none to resume, or another process uses it.
       ConfigError: the config does not fit the environment, or the devices.
-      ArtifactError: another run does not hold what the config takes from it.
+      ArtifactError: another run lacks a part that the config takes from it.
     """
     devices = make_devices(shard, config)
     env, source = make_envs(config)

@@ -28,7 +28,7 @@ class Command(command_line.Command):
     host: int = 0
     """Index of this host."""
     coordinator: Annotated[str, tyro.conf.arg(metavar="HOST:PORT")] = ""
-    """Address of the first host, with any free port of it."""
+    """Address of the first host, with any of its free ports."""
 
 
 def main(args: Sequence[str] | None = None) -> int:

@@ -61,10 +61,10 @@ def window_losses(
 
     `disturbance` [L, P] is added to the normalised states that D reads.
 
-    E descends the sum L_recons + lambda_kl L_KL + lambda_pred L_pred - lambda_adv L_adv (and, where D emits an
-    end signal, lambda_end times its loss), and F descends L_adv: the reversal in front of F changes the sign on its
-    way into E and nowhere else. Under termination predict the window is cut where Algorithm 1 stops, and L_pred is
-    the sum over the prefixes up to there; otherwise L_pred is of the whole window.
+    E descends the sum L_recons + lambda_kl L_KL + lambda_pred L_pred - lambda_adv L_adv (and, if D emits an end signal,
+    lambda_end times its loss), and F descends L_adv: the reversal in front of F changes the sign on its way into E and
+    nowhere else. Under termination predict Algorithm 1 cuts the window, and L_pred is the sum over the prefixes up to
+    there; otherwise L_pred is of the whole window.
     """
     means, log_stds = model.encode(window.actions)
     last = jnp.sum(window.mask, dtype=jnp.int32) - 1

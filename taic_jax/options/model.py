@@ -94,7 +94,7 @@ class OpenDecoder(nn.Module):
 class ClosedDecoder(nn.Module):
     """D in closed loop: pi(a|o, s) and the end logit, from the normalised state of each tick (§4.2.2, §5).
 
-    The carry counts the ticks, as a share of the longest option: without it an end signal could not tell time.
+    The carry counts the ticks, as a share of the longest option: without it an end signal could not depend on time.
     """
 
     action_size: int

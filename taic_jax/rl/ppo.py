@@ -191,7 +191,7 @@ def _explore_anew(
 
 
 def _metrics(config: PPOConfig, state: TrainState, ticks: Rollout, result: Update, length: int) -> dict[str, Array]:
-    """Return the scalars of one iteration and, where options take more than one tick, their durations [L]."""
+    """Return the scalars of one iteration and, if options take more than one tick, their durations [L]."""
     count = jnp.sum(ticks.decision, dtype=jnp.int32)
     num_updates = config.epochs * ((count + config.minibatch_size - 1) // config.minibatch_size)
     terms = dict(zip(LOSSES, result.terms / num_updates.astype(jnp.float32), strict=True))
