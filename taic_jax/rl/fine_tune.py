@@ -140,7 +140,7 @@ def iterate(
 ) -> tuple[ppo.TrainState, Tuned, dict[str, Array]]:
     """Run one iteration: one of PPO over options with noise on D's actions, then D's epochs on the same ticks.
 
-    `config` is of PPO; its `clip`, `gamma`, `lambda_` and `max_grad_norm` apply to D too. `fine` has D's other settings,
+    `config` is of PPO; its `clip`, `gamma`, `lambda_` and `max_grad_norm` apply to D too. `fine` has its other settings,
     `executor` the learnt options. Returns the next state, D, and the metrics of both.
     """
     noisy = NoisyExecutor(tuned_executor(executor, tuned.decoder), fine.std)
