@@ -140,8 +140,8 @@ def iterate(
 ) -> tuple[ppo.TrainState, Tuned, dict[str, Array]]:
     """Run one iteration: one of PPO over options with noise on D's actions, then D's epochs on the same ticks.
 
-    `config` is of PPO; its `clip`, `gamma`, `lambda_` and `max_grad_norm` apply to D too. `fine` has its other settings,
-    `executor` the learnt options. Returns the next state, D, and the metrics of both.
+    `config` is of PPO; its `clip`, `gamma`, `lambda_` and `max_grad_norm` apply to D too. `fine` has its other
+    settings, `executor` the learnt options. Returns the next state, D, and the metrics of both.
     """
     noisy = NoisyExecutor(tuned_executor(executor, tuned.decoder), fine.std)
     after, metrics, ticks, judgement = ppo.iterate(config, env, noisy, num_iterations, state)
