@@ -24,7 +24,7 @@ from taic_jax.options.execution import IdentityExecutor
 from taic_jax.rl import ppo
 from taic_jax.rl.rollout import Rollout
 from taic_jax.runtime.checkpoint import ArtifactError
-from taic_jax.runtime.files import DESCRIPTION, save_description, whole_file, writing
+from taic_jax.runtime.files import DESCRIPTION, save_description, atomic_file, writing
 from taic_jax.types import as_arrays
 
 EXPERIENCE = "experience"
@@ -92,7 +92,7 @@ class ExperienceStore:
           SaveError: it cannot be written.
         """
         path = self.folder / f"{iteration:06d}.npz"
-        with whole_file(path) as file:
+        with atomic_file(path) as file:
             np.savez(file, **vars(block))
         with writing(path):
             (self.folder / f"{iteration - self.capacity:06d}.npz").unlink(missing_ok=True)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from taic_jax.runtime.files import whole_file
+from taic_jax.runtime.files import atomic_file
 from taic_jax.sweep.axes import Axis, Point
 
 
@@ -20,7 +20,7 @@ def draw_marginals(path: Path, axes: Sequence[Axis], points: Sequence[Point], sc
         _draw(panel, axis, [points[i][axis.name] for i in scores], np.array(list(scores.values()), float))
         panel.set_xlabel(axis.name)
     panels[0].set_ylabel("return, interquartile mean")
-    with whole_file(path) as file:
+    with atomic_file(path) as file:
         figure.savefig(file, format="png", dpi=120)
 
 
