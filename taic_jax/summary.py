@@ -20,7 +20,7 @@ from taic_jax.envs.rendering import write_webp
 from taic_jax.nonfinite import FINITE, QUANTITIES
 from taic_jax.rl.ppo import Agent, num_iterations
 from taic_jax.runtime.driver import Run, Stopped
-from taic_jax.runtime.files import json_safe, atomic_file, writes_here
+from taic_jax.runtime.files import atomic_file, json_safe, writes_here
 from taic_jax.runtime.run_folder import Method, Summary
 
 PACKAGES = ("taic_jax", "jax", "jaxlib", "flax", "optax", "brax", "mujoco", "mujoco-mjx", "orbax-checkpoint")

@@ -11,7 +11,7 @@ import numpy as np
 
 from taic_jax.analysis.option_space import encode_windows
 from taic_jax.artifacts.experience import gather_experience
-from taic_jax.artifacts.models import OPTIONS, Body, described_body, load_options
+from taic_jax.artifacts.models import OPTIONS, Body, load_options, read_body
 from taic_jax.config import COLLECT, ConfigError, OptionsConfig
 from taic_jax.options.dataset import Experience
 from taic_jax.options.model import OptionModel
@@ -40,7 +40,7 @@ def option_plot(run: LoadedRun, count: int) -> dict[str, Any]:
         return {"missing": "options are not learnt yet"}
     home, config = _learnt_in(run.folder, run.config.options)
     try:
-        body = described_body(folder)
+        body = read_body(folder)
         models = load_options(folder, body, config, 1)
     except ArtifactError as error:
         return {"missing": str(error)}

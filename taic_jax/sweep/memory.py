@@ -1,4 +1,4 @@
-"""How many points of a sweep fit into memory at once: measured on the programs for one row."""
+"""The number of points of a sweep that fit into memory at once, measured on the programs for one row."""
 
 from pathlib import Path
 from typing import Any
@@ -18,10 +18,9 @@ MIB = 2**20
 
 
 def points_that_fit(config: Config, memory: int) -> int:
-    """Return how many points, each with all its seeds, run in `memory` MiB; 0 stands for half of the machine's.
+    """Return the number of points, each with all seeds, that run in `memory` MiB (0: half of the machine's).
 
-    Raises:
-      ConfigError: not even one does.
+    Raise ConfigError if not even one does.
     """
     limit, used = (memory or machine_memory() // 2) * MIB, psutil.Process().memory_info().rss
     _, source = make_envs(config)
@@ -38,7 +37,7 @@ def points_that_fit(config: Config, memory: int) -> int:
 
 
 def row_bytes(config: Config) -> int:
-    """Return the bytes that one row takes at most in flat PPO and in selecting windows: arguments, results, scratch."""
+    """Return the most bytes of one row in flat PPO and in selecting windows: arguments, results and scratch."""
     env, source = make_envs(config)
     rows = as_rows([config], 1)
     keys = jax.random.split(jax.random.key(0), 1)
@@ -64,7 +63,7 @@ def _step_bytes(rows: Config, env: Any, stage: str, keys: jax.Array) -> int:
 
 
 def _experience(config: Config, env: Any) -> list[Experience]:
-    """Return the shapes of the experience that options are learnt from, one row of each source."""
+    """Return the shapes of the experience for learning options, one row of each source."""
     ppo = config.collect.ppo
     ticks = min(num_blocks(config.collect) * ppo.rollout_length, config.collect.ticks // ppo.num_envs)
     shapes = [(1, ticks, ppo.num_envs, *last) for last in ([env.proprioceptive_size], [env.action_size], [], [])]

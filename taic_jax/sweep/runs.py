@@ -31,9 +31,9 @@ TableRow = dict[str, Any]
 
 @dataclasses.dataclass
 class Plan:
-    """The axes and counts of a sweep, its points [G], and the chunks of their indices that run in one program each.
+    """The axes and counts of a sweep, its points [G], and the chunks of their indices, each for one program.
 
-    Points that Optuna suggests are added as it does; `trials` are its numbers of them.
+    Optuna's points are added as it suggests them; `trials` are its numbers of them.
     """
 
     axes: list[str]
@@ -70,17 +70,14 @@ def run_sweep(
 ) -> None:
     """Run the missing chunks; write the table after each, and at the end the best point and the marginal plots.
 
-    Raises:
-      Interrupted: a signal was received; resume goes on from where it came.
-      RunFolderError: the folder holds another sweep, or none to resume, or another process is at it.
+    Raise Interrupted at a signal, and RunFolderError for a folder of another sweep, none to resume, or a busy one.
     """
     config = sweep_config(config)
     if plan.pbt:
-        bounds = {axis.name: axis.bounds for axis in axes}
-        settings["population"] = Population(plan.pbt, bounds, config.seeds)
+        settings["population"] = Population(plan.pbt, {axis.name: axis.bounds for axis in axes}, config.seeds)
     RunFolder(run_dir).prepare(config, resume=resume, overwrite=overwrite)
     with RunFolder(run_dir).claimed():
-        plan = _resumed(plan, run_dir) if resume else plan
+        plan = _resume(plan, run_dir) if resume else plan
         plan.save(run_dir)
         if resume and (run_dir / BEST).is_file():
             print(f"taic_jax: {run_dir} is finished: see {run_dir / TABLE}", file=sys.stderr)
@@ -99,12 +96,12 @@ def run_sweep(
 
 
 def sweep_config(config: Config) -> Config:
-    """Return the config that all points start from: without videos."""
+    """Return the config of all points before their own fields: without videos."""
     return replace(config, "evaluate.video_ticks", 0)
 
 
 def _best_point(plan: Plan, table: list[TableRow]) -> tuple[str, Point]:
-    """Print the best point, and return it, with nothing to stand before its config."""
+    """Print and return the best point, with an empty header of its config."""
     best = max(table, key=lambda row: row["iqm"])
     point = plan.points[best["point"]]
     print(f"best: {show(point)}: {best['iqm']:.4g} ({best['low']:.4g} … {best['high']:.4g})")
@@ -112,7 +109,7 @@ def _best_point(plan: Plan, table: list[TableRow]) -> tuple[str, Point]:
 
 
 def _best_member(config: Config, plan: Plan, run_dir: Path) -> tuple[str, Point]:
-    """Print the best member of all populations, and return its schedule, as comments, and its last point."""
+    """Print the best member of all populations; return its schedule, as comments, and its last point."""
     folder = RunFolder(run_dir / "chunk-000")
     returns = np.array(folder.summary()["methods"]["taic"]["return"]["per_seed"], float)
     best = int(np.nanargmax(returns))
@@ -124,7 +121,7 @@ def _best_member(config: Config, plan: Plan, run_dir: Path) -> tuple[str, Point]
 
 
 def run_chunk(config: Config, plan: Plan, run_dir: Path, settings: dict[str, Any], chunk: int) -> list[TableRow]:
-    """Run one chunk, unless it is done, and return a row per point."""
+    """Run one chunk, unless it is finished, and return a row per point."""
     folder, indices = RunFolder(run_dir / f"chunk-{chunk:03d}"), plan.chunks[chunk]
     points = configs_of(config, [plan.points[i] for i in indices])
     if not folder.finished:
@@ -133,7 +130,7 @@ def run_chunk(config: Config, plan: Plan, run_dir: Path, settings: dict[str, Any
         except DivergedError as error:
             print(f"taic_jax: {error}", file=sys.stderr)
             save_json(folder.summary_path, {"methods": {}})
-    for name in (EXPERIENCE, "checkpoints"):  # only needed to go on; a sweep that was killed here may have left some
+    for name in (EXPERIENCE, "checkpoints"):  # only a resume needs them; a sweep killed here leaves some
         shutil.rmtree(folder.path / name, ignore_errors=True)
     if methods := folder.summary()["methods"]:
         returns = methods["taic"]["return"]
@@ -155,22 +152,18 @@ def _row(config: Config, plan: Plan, i: int, returns: np.ndarray, first: np.ndar
 
 
 def _on_cluster(work: partial, settings: dict[str, Any], batch: Sequence[int]) -> Iterator[list[TableRow]]:
-    """Run the chunks of a batch as tasks of the cluster that this process is connected to."""
+    """Run the chunks of a batch as tasks of the connected cluster."""
     from taic_jax.sweep.ray_tasks import run_tasks
 
-    theirs = {name: value for name, value in settings.items() if name != "signals"}  # signals are this process's
-    return run_tasks(work, [(theirs, chunk) for chunk in batch], settings.get("signals"))
+    remote = {name: value for name, value in settings.items() if name != "signals"}  # signals are this process's
+    return run_tasks(work, [(remote, chunk) for chunk in batch], settings.get("signals"))
 
 
 def _batches(
     config: Config, axes: list[Axis], plan: Plan, run_dir: Path, table: list[TableRow]
 ) -> Iterator[Sequence[int]]:
-    """Yield the chunks to run; with Optuna, report the table of those before it suggests the points of the next.
-
-    Chunks of one batch may run in any order, or at once.
-    """
-    chunk = len(plan.chunks)
-    yield range(chunk)
+    """Yield batches of chunks to run in any order; with Optuna, report each batch's table before asking for the next."""
+    yield range(len(plan.chunks))
     if not plan.optuna:
         return
     from taic_jax.sweep.optuna_study import Study
@@ -180,10 +173,10 @@ def _batches(
         for row in table[reported:]:
             study.tell(plan.trials[row["point"]], row["iqm"])
         reported, first, chunk = len(table), len(plan.points), len(plan.chunks)
-        wanted = min(plan.size, plan.optuna - first)
-        if wanted <= 0:
+        count = min(plan.size, plan.optuna - first)
+        if count <= 0:
             return
-        trials, points = study.ask(wanted)
+        trials, points = study.ask(count)
         configs_of(config, points)
         plan.trials += trials
         plan.points += points
@@ -192,11 +185,10 @@ def _batches(
         yield range(chunk, len(plan.chunks))
 
 
-def _resumed(plan: Plan, run_dir: Path) -> Plan:
-    """Return the plan of the sweep in the folder; the new one where that was killed before it wrote its own.
+def _resume(plan: Plan, run_dir: Path) -> Plan:
+    """Return the folder's plan, or the new one if a sweep was killed before it wrote any.
 
-    Raises:
-      RunFolderError: there is none, or it is of other axes.
+    Raise RunFolderError without a plan, or for one of other axes.
     """
     if {path.name for path in run_dir.iterdir()} == {RunFolder(run_dir).config_path.name, LOCK}:
         return plan
