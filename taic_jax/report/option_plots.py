@@ -1,4 +1,4 @@
-"""The option space of a run, for a picture: codes on their first two principal components, and what they change."""
+"""The option space of a run, for a picture: codes on two principal components, and the changes they cause."""
 
 import contextlib
 from functools import partial
@@ -22,11 +22,11 @@ from taic_jax.types import as_arrays
 
 
 def option_plot(run: LoadedRun, count: int) -> dict[str, Any]:
-    """Return the picture of the first seed's option model, ready for JSON, or why there is none.
+    """Return the picture of the first seed's option model, ready for JSON, or the reason against one.
 
-    The options are the means of q(o|a) over windows drawn from what the model was learnt from, coloured by the change
-    of state these windows recorded. Without that experience they are drawn from the prior, coloured by the change
-    that P predicts from the mean state. With a count of 0 the picture is left out.
+    The options are the means of q(o|a) over windows of the model's experience, coloured by the change of state in these
+    windows. Without experience they are drawn from the prior, coloured by the change that P predicts from the mean
+    state. A count of 0 omits the picture.
     """
     if not count:
         return {"missing": "left out by --options 0"}
@@ -38,7 +38,7 @@ def option_plot(run: LoadedRun, count: int) -> dict[str, Any]:
     folder = source / OPTIONS if (source / OPTIONS).is_dir() else source
     if folder == run.folder:
         return {"missing": "options are not learnt yet"}
-    home, config = _learnt_in(run.folder, run.config.options)
+    home, config = _origin(run.folder, run.config.options)
     try:
         body = read_body(folder)
         models = load_options(folder, body, config, 1)
@@ -50,14 +50,14 @@ def option_plot(run: LoadedRun, count: int) -> dict[str, Any]:
     except (ArtifactError, OSError) as error:
         experience, why = None, f"what they were learnt from is not there: {error}"
     if experience:
-        codes, drawn = _encoded(config, model, experience, count), "windows"
+        picture = _picture(*_window_codes(config, model, experience, count))
     else:
-        codes, drawn = _from_prior(config, model, count), "prior"
-    return _picture(*codes) | {"drawn": drawn, "why": why}
+        picture = _picture(*_prior_codes(config, model, count))
+    return picture | {"drawn": "windows" if experience else "prior", "why": why}
 
 
-def _learnt_in(folder: Path, config: OptionsConfig) -> tuple[Path, OptionsConfig]:
-    """Return the run whose experience the options of a run were learnt from, and how they were."""
+def _origin(folder: Path, config: OptionsConfig) -> tuple[Path, OptionsConfig]:
+    """Return the run whose experience the options of a run were learnt from, and the config of that learning."""
     if not config.source:
         return folder, config
     home = run_of(config.source)
@@ -67,25 +67,21 @@ def _learnt_in(folder: Path, config: OptionsConfig) -> tuple[Path, OptionsConfig
 
 
 def _experience(folder: Path, config: OptionsConfig, body: Body) -> list[Experience]:
-    """Return the first seed's experience that options were learnt from.
-
-    Raises:
-      ArtifactError, OSError: it is not there.
-    """
+    """Return the first seed's experience behind the options, or raise ArtifactError or OSError."""
     sources = [folder if name == COLLECT else Path(name) for name in config.experience or (COLLECT,)]
     return [jax.tree.map(lambda x: x[0], gather_experience(source, body, 1)) for source in sources]
 
 
-def _encoded(
+def _window_codes(
     config: OptionsConfig, model: OptionModel, experience: list[Experience], count: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the codes [N, D] of windows and the changes [N, P] they recorded."""
+    """Return the codes [N, D] of windows and the changes [N, P] in them."""
     encode = jax.jit(encode_windows, static_argnums=4)
     windows = jax.device_get(encode(as_arrays(config), model, experience, jax.random.key(0), count))
     return windows.mean, windows.end - windows.start
 
 
-def _from_prior(config: OptionsConfig, model: OptionModel, count: int) -> tuple[np.ndarray, np.ndarray]:
+def _prior_codes(config: OptionsConfig, model: OptionModel, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Return codes [N, D] drawn from the prior and the changes [N, P] that P predicts from the mean state."""
     option = jax.random.normal(jax.random.key(0), (count, config.size))
     predict = partial(model.predict, jnp.zeros(model.state_size))
@@ -94,7 +90,7 @@ def _from_prior(config: OptionsConfig, model: OptionModel, count: int) -> tuple[
 
 
 def _picture(option: np.ndarray, change: np.ndarray) -> dict[str, Any]:
-    """Project codes on their principal components, and say how well these two tell each coordinate's change."""
+    """Project codes on two principal components, and add the R^2 of each coordinate's change by these."""
     plane, shares = principal_plane(option)
     r2 = [_r2(plane, column) for column in change.T]
     picture = json_safe({"shares": shares, "changes": change.T, "r2": r2}, 3)
@@ -102,9 +98,9 @@ def _picture(option: np.ndarray, change: np.ndarray) -> dict[str, Any]:
 
 
 def principal_plane(option: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return codes [N, D] in the plane [N, 2] of their first two principal components, and the variance these hold.
+    """Return codes [N, D] in the plane [N, 2] of their first two principal components, and the components' variance.
 
-    A space of one dimension has nothing in the second; signs are such that the largest weight is positive.
+    Codes of one dimension get zeros as the second; signs are such that the largest weight is positive.
     """
     centred = option - option.mean(axis=0)
     _, scales, axes = np.linalg.svd(centred, full_matrices=False)
@@ -115,7 +111,7 @@ def principal_plane(option: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _r2(plane: np.ndarray, change: np.ndarray) -> float:
-    """Return the share of a coordinate's change that is linear in the plane; NaN where it never changes."""
+    """Return the share of a coordinate's change that is linear in the plane; NaN for a constant one."""
     total = ((change - change.mean()) ** 2).sum()
     if total < 1e-12 * len(change):
         return float("nan")

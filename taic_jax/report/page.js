@@ -5,7 +5,7 @@ window.addEventListener("error", (event) => { document.body.dataset.errors = eve
 
 const data = JSON.parse(document.getElementById("data").textContent);
 
-// Make an element; text is set as text, so nothing in a run's config or name can become markup.
+// Make an element; text stays text, so that no config or name of a run becomes markup.
 function make(name, attributes, ...children) {
   return fill(document.createElement(name), attributes, children);
 }
@@ -77,7 +77,7 @@ function change(changes) {
   const changed = Object.entries(view).filter(([name, value]) => value !== DEFAULTS[name]);
   try {
     history.replaceState(null, "", changed.length ? "#" + new URLSearchParams(changed) : location.pathname + location.search);
-  } catch { /* some viewers of files refuse it; the view changes all the same */ }
+  } catch { /* some viewers of files refuse it */ }
   redraw();
 }
 

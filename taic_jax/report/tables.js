@@ -1,4 +1,4 @@
-// Tables: what was run, what each method reached, sweeps, and configs side by side.
+// Tables: runs, results of methods, sweeps, and configs side by side.
 
 // A row of a table is its cells: text, elements, or td and th of one's own.
 function table(label, heads, rows, kind) {

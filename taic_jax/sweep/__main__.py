@@ -49,9 +49,7 @@ def execute(command: Command) -> int:
 
         connect(command.cluster)
     if command.optuna:
-        importlib.import_module(
-            "taic_jax.sweep.optuna_study"
-        )  # an uninstalled Optuna is refused before the folder is made
+        importlib.import_module("taic_jax.sweep.optuna_study")  # fails without Optuna, before a folder is made
     else:
         points = sample(axes, command.samples, config.seed) if command.samples else grid(axes)
         configs_of(config, points)

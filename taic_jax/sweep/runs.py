@@ -162,7 +162,7 @@ def _on_cluster(work: partial, settings: dict[str, Any], batch: Sequence[int]) -
 def _batches(
     config: Config, axes: list[Axis], plan: Plan, run_dir: Path, table: list[TableRow]
 ) -> Iterator[Sequence[int]]:
-    """Yield batches of chunks to run in any order; with Optuna, report each batch's table before asking for the next."""
+    """Yield batches of chunks to run in any order; with Optuna, report each batch's table before the next."""
     yield range(len(plan.chunks))
     if not plan.optuna:
         return
