@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Key
 
-from taic_jax.envs.base import Env, State
+from taic_jax.envs.base import Env
 from taic_jax.envs.wrappers import AutoReset
 from taic_jax.rl.ppo import Agent
 from taic_jax.rl.rollout import Rollout, count_durations, rollout, start
@@ -43,7 +43,7 @@ def record(env: Env, agent: Agent, key: Key[Array, ""], ticks: int) -> Any:
 
 
 def _run(
-    env: Env, agent: Agent, key: Array, num_envs: int, ticks: int, exploration: Scalar, extras: Callable[[State], Any]
+    env: Env, agent: Agent, key: Key[Array, ""], num_envs: int, ticks: int, exploration: Scalar, extras: Callable
 ) -> Rollout:
     key_start, key_rollout = jax.random.split(key)
     env = AutoReset(env.evaluated)

@@ -131,10 +131,7 @@ def mutual_information(x: ArrayLike, y: ArrayLike, k: int = 3, components: int |
 def permutation_baseline(
     x: ArrayLike, y: ArrayLike, draws: int = PERMUTATIONS, seed: int = 0, k: int = 3, components: int | None = None
 ) -> tuple[float, float]:
-    """Return mean and 95 % quantile of `mutual_information` over permutations of the rows of y.
-
-    About 5 % of unrelated pairs reach an estimate above the quantile (François et al., 2006).
-    """
+    """Return mean and 95 % quantile of `mutual_information` for permuted rows of y (François et al., 2006)."""
     x_distances, y_distances = _max_norms(x, y, k, components)
     rng = np.random.default_rng(seed)
     orders = (rng.permutation(len(y_distances)) for _ in range(draws))

@@ -18,8 +18,7 @@ from taic_jax.options.model import OptionModel
 from taic_jax.rl.rollout import rollout, start
 from taic_jax.types import as_arrays
 
-WARM_UP = 100
-"""Ticks of random options before a measure from many states: these are then states that options lead to."""
+WARM_UP = 100  # ticks of random options before a measure from many states: these are then states options lead to
 
 
 class Effects(struct.PyTreeNode):
@@ -83,7 +82,11 @@ class WindowCodes(struct.PyTreeNode):
 
 
 def encode_windows(
-    config: OptionsConfig, model: OptionModel, experience: Experience | Sequence[Experience], key: Array, count: int
+    config: OptionsConfig,
+    model: OptionModel,
+    experience: Experience | Sequence[Experience],
+    key: Key[Array, ""],
+    count: int,
 ) -> WindowCodes:
     """Encode `count` windows of `config.length` ticks, drawn from the selection."""
     dataset = make_dataset(experience, config)

@@ -39,8 +39,7 @@ def as_experience(ticks: Rollout, proprioceptive_size: int) -> Experience:
 def collect(config: CollectConfig, env: Env, key: Key[Array, ""]) -> tuple[ppo.Agent, dict[str, Array], Experience]:
     """Train flat PPO in `env`; pure, so keys may be vmapped.
 
-    Return the agent, the metrics of every iteration, and the experience [T, B, ...]: at most `config.capacity` ticks,
-    the newest.
+    Return the agent, the metrics of every iteration, and the newest experience [T, B, ...], within the capacity.
     """
     config = as_arrays(config)
     executor = IdentityExecutor(env.action_size)

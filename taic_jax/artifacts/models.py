@@ -1,7 +1,4 @@
-"""Artifacts of a run for other runs: its option models and flat policies, with a description that refuses misuse.
-
-An artifact is a folder: the tree of arrays with leading axis K (one per seed), and `description.json`.
-"""
+"""Artifacts of a run for other runs: folders of its option models or flat policies [K], and `description.json`."""
 
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -53,10 +50,7 @@ def describe(env: Env | Body) -> dict[str, Any]:
 
 
 def check_description(folder: Path, kind: str, env: Env | Body, structure: dict[str, Any]) -> dict[str, Any]:
-    """Return the description of an artifact with the body of `env` and this structure.
-
-    Raise ArtifactError without one, or with the first difference in body or structure.
-    """
+    """Return an artifact's description, or raise ArtifactError at its first difference from this body and structure."""
     description = read_description(folder)
     if description is None:
         raise ArtifactError(f"{folder}: expected a run that got this far, or its {kind}; got none")
@@ -77,23 +71,20 @@ def save_options(folder: Path, model: OptionModel, env: Env, config: OptionsConf
 
 
 def load_options(source: Path, env: Env | Body, config: OptionsConfig, seeds: int) -> OptionModel:
-    """Load option models [seeds] from a run or an artifact; seed k takes the model k modulo their number.
-
-    Raise ArtifactError without any, or for another body or structure.
-    """
+    """Load option models [seeds] from a run or an artifact, or raise ArtifactError; seed k takes model k modulo K."""
     folder = source / OPTIONS if (source / OPTIONS).is_dir() else source
     description = check_description(folder, "option model", env, _structure(config))
-    return _load(folder, description["seeds"], seeds, lambda: _empty_model(config, env))
+
+    def empty() -> OptionModel:
+        networks = make_networks(config, env.proprioceptive_size, env.action_size)
+        params, zeros = init_params(networks, config, jax.random.key(0)), jnp.zeros(env.proprioceptive_size)
+        return OptionModel(params, Scale(zeros, zeros), Scale(zeros, zeros), jnp.zeros(()), networks)
+
+    return _load(folder, description["seeds"], seeds, empty)
 
 
 def _structure(config: OptionsConfig) -> dict[str, Any]:
     return {f"options.{name}": getattr(config, name) for name in STRUCTURE}
-
-
-def _empty_model(config: OptionsConfig, env: Env | Body) -> OptionModel:
-    networks = make_networks(config, env.proprioceptive_size, env.action_size)
-    params, zeros = init_params(networks, config, jax.random.key(0)), jnp.zeros(env.proprioceptive_size)
-    return OptionModel(params, Scale(zeros, zeros), Scale(zeros, zeros), jnp.zeros(()), networks)
 
 
 def save_policy(folder: Path, agent: Agent, env: Env) -> None:
@@ -107,10 +98,9 @@ def save_policy(folder: Path, agent: Agent, env: Env) -> None:
 
 
 def load_policy(source: Path, env: Env, config: PPOConfig, seeds: int) -> tuple[PolicyParams, normalize.Statistics]:
-    """Load flat policies [seeds] of a run on another task of the same body, fitted to the observations of `env`.
+    """Load flat policies [seeds] of a run on another task of the same body, or raise ArtifactError.
 
-    Input weights of the proprioceptive slice are copied; the other entries of `env` get zero weights and new
-    statistics. Raise ArtifactError without a policy, or for another body or other layers.
+    Input weights of the proprioceptive slice are copied; other observations of `env` get zeros and new statistics.
     """
     folder = source / POLICY
     structure = {"hidden_sizes": list(config.hidden_sizes)}

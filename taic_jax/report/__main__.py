@@ -36,11 +36,7 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 def execute(command: Command) -> int:
-    """Write the page and print its path.
-
-    Raises:
-      ConfigError: an argument is not valid.
-    """
+    """Write the page and print its path, or raise ConfigError for an invalid argument."""
     if not command.runs:
         raise ConfigError("RUNS: expected at least one folder of a run, got none")
     for name, value, least in (("points", command.points, 2), ("options", command.options, 0)):

@@ -44,13 +44,10 @@ function nearest(length, distance) {
   return best;
 }
 
-function figure(title, attributes, ...children) {
-  return make("figure", { class: "chart", ...attributes }, make("figcaption", {}, title), children);
-}
+const figure = (title, attributes, ...children) =>
+  make("figure", { class: "chart", ...attributes }, make("figcaption", {}, title), children);
 
-function readout() {
-  return make("p", { class: "readout", "aria-live": "polite" });
-}
+const readout = () => make("p", { class: "readout", "aria-live": "polite" });
 
 function swatch({ dashed, colour }) {
   return draw("svg", { width: 26, height: 10, "aria-hidden": "true", class: "swatch", style: `--own:${colour}` },

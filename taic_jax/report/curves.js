@@ -96,9 +96,7 @@ function curveAxes(shown, frame) {
   return axes(frame, ticks(frame.x, frame.width < 500 ? 3 : 6, short), y, label);
 }
 
-function drawable(value, frame) {
-  return value !== null && (!frame.log || value > 0);
-}
+const drawable = (value, frame) => value !== null && (!frame.log || value > 0);
 
 // A path along the values, or around the area between them and others; missing values leave gaps.
 function path(x, values, frame, others) {

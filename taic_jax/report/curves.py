@@ -9,8 +9,7 @@ from taic_jax.config import COLLECT, METHOD_LABELS
 from taic_jax.report.runs import LoadedRun, ReportError, per_seed, read_run, run_of
 from taic_jax.runtime.files import json_safe
 
-DIGITS = 5
-"""Significant digits of curves."""
+DIGITS = 5  # significant, of curves
 LABELS = METHOD_LABELS | {"train": METHOD_LABELS["taic"], "learn": "learning of options"}
 
 
@@ -42,10 +41,9 @@ def thinned(count: int, points: int) -> list[int]:
 
 
 def pretraining(run: LoadedRun, stage: str, above: tuple[str, ...] = ()) -> tuple[int, list[str]]:
-    """Return the interactions per seed of the runs that a stage builds on, and the names of unreadable ones.
+    """Return the interactions per seed of the runs that a stage builds on but those `above`, and unreadable runs.
 
-    Options build on the experience for learning them; baseline `transfer` on the source run's policy. Runs `above` are
-    counted already.
+    Options build on the experience for learning them; baseline `transfer` on the source run's policy.
     """
     source = str(run.fields.get("options.source") or "")
     if stage == "transfer":
@@ -71,10 +69,7 @@ def _spent_in(name: str, stage: str, above: tuple[str, ...]) -> tuple[int, list[
 
 
 def _over_seeds(values: list[np.ndarray | None]) -> dict[str, Any] | None:
-    """Return every seed's curve, the interquartile mean and its 95 % interval; None without a number.
-
-    As in the summary, an iteration has no statistics if a seed has no number.
-    """
+    """Return every seed's curve, and iqm and 95 % interval of iterations where all seeds have one; None without any."""
     width = max((len(value) for value in values if value is not None), default=0)
     table = np.array([np.full(width, np.nan) if value is None else value for value in values])
     if not np.isfinite(table).any():

@@ -98,15 +98,12 @@ def _picture(option: np.ndarray, change: np.ndarray) -> dict[str, Any]:
 
 
 def principal_plane(option: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return codes [N, D] in the plane [N, 2] of their first two principal components, and the components' variance.
-
-    Codes of one dimension get zeros as the second; signs are such that the largest weight is positive.
-    """
+    """Return codes [N, D] in the plane [N, 2] of two principal components, of positive largest weight, and variances."""
     centred = option - option.mean(axis=0)
     _, scales, axes = np.linalg.svd(centred, full_matrices=False)
     axes = axes * np.sign(axes[np.arange(len(axes)), np.abs(axes).argmax(axis=1)])[:, None]
     plane, shares = centred @ axes[:2].T, scales**2 / max((scales**2).sum(), np.finfo(float).tiny)
-    missing = max(2 - plane.shape[1], 0)
+    missing = max(2 - plane.shape[1], 0)  # codes of one dimension get zeros as the second
     return np.pad(plane, ((0, 0), (0, missing))), np.pad(shares[:2], (0, missing))
 
 

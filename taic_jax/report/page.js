@@ -6,13 +6,9 @@ window.addEventListener("error", (event) => { document.body.dataset.errors = eve
 const data = JSON.parse(document.getElementById("data").textContent);
 
 // Make an element; text stays text, so that no config or name of a run becomes markup.
-function make(name, attributes, ...children) {
-  return fill(document.createElement(name), attributes, children);
-}
-
-function draw(name, attributes, ...children) {
-  return fill(document.createElementNS("http://www.w3.org/2000/svg", name), attributes, children);
-}
+const make = (name, attributes, ...children) => fill(document.createElement(name), attributes, children);
+const SVG = "http://www.w3.org/2000/svg";
+const draw = (name, attributes, ...children) => fill(document.createElementNS(SVG, name), attributes, children);
 
 function fill(element, attributes, children) {
   for (const [name, value] of Object.entries(attributes)) {
@@ -23,9 +19,7 @@ function fill(element, attributes, children) {
   return element;
 }
 
-function unique(values) {
-  return [...new Set(values)];
-}
+const unique = (values) => [...new Set(values)];
 
 // ---- numbers
 
@@ -38,13 +32,8 @@ function number(x, digits = 4) {
   return x < 0 ? "\u2212" + text : text;
 }
 
-function count(x) {
-  return Number.isFinite(x) ? Math.round(x).toLocaleString("fr") : "–"; // thin spaces between thousands
-}
-
-function percent(share, digits) {
-  return number(100 * share, digits) + " %";
-}
+const count = (x) => (Number.isFinite(x) ? Math.round(x).toLocaleString("fr") : "–"); // thin spaces between thousands
+const percent = (share, digits) => number(100 * share, digits) + " %";
 
 // Ticks of an axis: 250 k, 1 M.
 function short(x) {
@@ -57,9 +46,7 @@ function extent(values) {
   return finite.length ? finite.reduce(([low, high], x) => [Math.min(low, x), Math.max(high, x)], [Infinity, -Infinity]) : null;
 }
 
-function bounds([low, high]) {
-  return low === null ? "" : `${number(low)} … ${number(high)}`;
-}
+const bounds = ([low, high]) => (low === null ? "" : `${number(low)} … ${number(high)}`);
 
 // ---- the view's state: #metric=entropy&x=all&seeds=off, so that any view is a link
 
@@ -81,9 +68,7 @@ function change(changes) {
   redraw();
 }
 
-function redraw() {
-  for (const one of redraws) one();
-}
+const redraw = () => { for (const one of redraws) one(); };
 
 // Settings that one field of the address holds for many drawings: "a:1,b:2".
 function settings(name) {

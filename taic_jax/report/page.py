@@ -33,10 +33,7 @@ class Detail:
 
 
 def write_report(folders: Sequence[Path], out: Path, detail: Detail = Detail()) -> None:
-    """Write the report on runs and sweeps to `out`, atomically.
-
-    Raise ReportError for a folder without a report, or if `out` is a file that is no report.
-    """
+    """Write the report on runs and sweeps to `out`, atomically, or raise ReportError; replace no other file."""
     if out.is_dir():
         nearest = out / "report.html"
         raise ReportError(f"--out: expected a file to write, got the folder {out}; the nearest is {nearest}")

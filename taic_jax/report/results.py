@@ -8,16 +8,11 @@ from taic_jax.analysis.statistics import summarize
 from taic_jax.report.curves import label_of, pretraining
 from taic_jax.report.runs import LoadedRun, per_seed
 
-MODES = ("return", "return_mean_option")
-"""Returns of the policy as it explores, and of its mean options."""
+MODES = ("return", "return_mean_option")  # of the policy as it explores, and of its mean options
 
 
 def methods_of(run: LoadedRun) -> list[dict[str, Any]]:
-    """Return a row of the table per method, ready for JSON.
-
-    Stages that the summary lacks (a collector on another task, a run that is not finished) are rows too, with their
-    evaluation if there is one.
-    """
+    """Return a row of the table per method, ready for JSON, and per stage that the summary lacks (see docs/report.md)."""
     results = {_stage_of(run, name): _from_summary(method) for name, method in run.methods.items()}
     for stage in run.trained_stages():
         if stage not in results:

@@ -70,12 +70,10 @@ class LoadedRun:
         return str(self.fields.get("collect.env") or self.task) if stage == COLLECT else self.task
 
     def flat_stage(self) -> str | None:
-        """Return the stage of baseline `flat`: its own, or else collect by the rule of `config.collector_is_baseline`.
-
-        The rule reads the fields, so that it also serves a config of another version.
-        """
+        """Return the stage of baseline `flat`: its own, or else collect by the rule of `config.collector_is_baseline`."""
         if self.of_stage("flat"):
             return "flat"
+        # By the fields, which a config of another version has, too.
         same = self.fields.get("collect.ticks") == self.fields.get("train.ticks") and self.task_of(COLLECT) == self.task
         return COLLECT if same and self.of_stage(COLLECT) else None
 

@@ -14,8 +14,8 @@ function optionFigure(run) {
   const order = options.r2.map((r2, i) => [r2, i]).filter(([r2]) => r2 !== null).sort((a, b) => b[0] - a[0]);
   if (!order.length) return null;
   const coordinate = () => {
-    const choice = Number(settings("coordinate").get(name)?.[0]);
-    return order.some(([, i]) => i === choice) ? choice : order[0][1];
+    const index = Number(settings("coordinate").get(name)?.[0]);
+    return order.some(([, i]) => i === index) ? index : order[0][1];
   };
   const picker = choice("coloured by the change of ", order.map(([r2, i]) => [i, `coordinate ${i} (R² ${number(r2, 2)})`]),
     coordinate, (value) => changeSetting("coordinate", name, [value]));

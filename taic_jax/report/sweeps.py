@@ -17,10 +17,7 @@ PER_SEED = ("per_seed", "first_per_seed")
 
 
 def read_sweep(folder: Path, name: str) -> tuple[dict[str, Any], list[LoadedRun]]:
-    """Return a sweep's table with notes on missing points, ready for JSON, and its begun points as runs.
-
-    Raise ReportError for a bad plan or without a finished iteration, ConfigError for a config of another version.
-    """
+    """Return a sweep's table and notes, ready for JSON, and its begun points as runs; raise ReportError or ConfigError."""
     try:
         plan = Plan(**json.loads((folder / PLAN).read_text()))
     except (OSError, ValueError, TypeError):

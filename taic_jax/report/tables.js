@@ -8,33 +8,13 @@ function table(label, heads, rows, kind) {
       make("tbody", {}, rows)));
 }
 
-function cell(content, kind) {
-  return make("td", { class: kind }, content);
-}
-
-function numeric(...contents) {
-  return contents.map((content) => cell(content, "n"));
-}
-
-function rowHead(...content) {
-  return make("th", { scope: "row" }, content);
-}
-
-function badge(text, kind = "partial") {
-  return make("span", { class: `badge ${kind}` }, text);
-}
-
-function list(texts, kind) {
-  return make("ul", { class: kind }, texts.map((text) => make("li", {}, text)));
-}
-
-function notes(texts) {
-  return texts.length > 0 && list(texts, "notes");
-}
-
-function differ(values) {
-  return unique(values).length > 1 ? "differs" : null;
-}
+const cell = (content, kind) => make("td", { class: kind }, content);
+const numeric = (...contents) => contents.map((content) => cell(content, "n"));
+const rowHead = (...content) => make("th", { scope: "row" }, content);
+const badge = (text, kind = "partial") => make("span", { class: `badge ${kind}` }, text);
+const list = (texts, kind) => make("ul", { class: kind }, texts.map((text) => make("li", {}, text)));
+const notes = (texts) => texts.length > 0 && list(texts, "notes");
+const differ = (values) => (unique(values).length > 1 ? "differs" : null);
 
 function factsTable() {
   const commits = differ(data.runs.map((run) => run.facts.commit).filter(Boolean));

@@ -116,19 +116,16 @@ def make_devices(shard: Shard, config: Config) -> Devices:
     count = jax.device_count()
     for name, ppo in (("collect", config.collect.ppo), ("train", config.train.ppo)):
         if shard == ENVS and ppo.num_envs % count:
-            nearest = max(round(ppo.num_envs / count), 1) * count
-            raise ConfigError(
-                f"--shard envs: expected {name}.ppo.num_envs to be a multiple of the {count} devices, "
-                f"got {ppo.num_envs}; the nearest valid value is {nearest}"
-            )
+            valid = f"the nearest valid value is {max(round(ppo.num_envs / count), 1) * count}"
+            expected = f"expected {name}.ppo.num_envs to be a multiple of the {count} devices"
+            raise ConfigError(f"--shard envs: {expected}, got {ppo.num_envs}; {valid}")
     return Devices(shard)
 
 
 def over_envs(scan: Callable[[Any, Any], tuple[Any, Any]], num_envs: int) -> Callable[[Any, Any], tuple[Any, Any]]:
     """Split a scan over ticks, (environments [B], [T, B]) -> ([B], [T, B]), over the devices of `--shard envs`.
 
-    The results are on all devices. If the environments, as in an evaluation, do not divide by the devices, each device
-    scans all.
+    The results are on all devices. If the environments do not divide by the devices, each device scans all.
     """
     count = jax.sharding.get_abstract_mesh().shape.get(ENVS)
     if count is None:

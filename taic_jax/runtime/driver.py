@@ -33,8 +33,8 @@ STAGE_STREAMS = {
     "collect": 0, "learn": 1, "train": 2, "flat": 3, "evaluate": 4, "video": 5, "repeat": 6, "total": 7, "transfer": 8,
 }  # fmt: skip
 """The stream of random numbers of each stage. A number is never reused: checkpoints of old runs depend on it."""
+# The stages whose results a stage starts from: a seed that stopped there stays stopped.
 BUILDS_ON = {"learn": ("collect",), "train": ("collect", "learn")}
-"""The stages whose results a stage starts from: a seed that stopped there stays stopped."""
 CHECKPOINT_SECONDS = 30.0
 DUMPS = "dumps"
 
@@ -163,11 +163,8 @@ class Run:
         for name, rows in {"state": state, "config": config}.items():
             save_tree(folder / name, jax.tree.map(lambda x: x[seed], rows))
         save_description(folder, description | {"quantity": quantity})
-        print(
-            f"taic_jax: seed {seed} stopped in {stage} after {step * unit:,}: its {quantity} is not finite; "
-            f"--replay {folder} shows it again",
-            file=sys.stderr,
-        )
+        why = f"its {quantity} is not finite; --replay {folder} shows it again"
+        print(f"taic_jax: seed {seed} stopped in {stage} after {step * unit:,}: {why}", file=sys.stderr)
 
     def compile(self, stage: str, function: Callable, *args: Any, donate: bool = False) -> Callable:
         """Compile ahead of time for placed rows; a call of other shapes or types fails instead of compiling again."""

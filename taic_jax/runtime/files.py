@@ -11,10 +11,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
-PARTIAL = ".partial"
-"""Ending of an incomplete file."""
-DESCRIPTION = "description.json"
-"""File that describes the arrays beside it."""
+PARTIAL = ".partial"  # ending of an incomplete file
+DESCRIPTION = "description.json"  # describes the arrays beside it
 TEMPORARY = ".orbax-checkpoint-tmp"  # Orbax writes a folder under this suffix, and renames it at the end
 
 
@@ -42,10 +40,7 @@ def writes_here() -> bool:
 
 @contextlib.contextmanager
 def atomic_file(path: Path) -> Iterator[BinaryIO]:
-    """Yield a file that replaces `path` at the end of the context, or is removed and raises SaveError if that fails.
-
-    On a host that does not write, yield a buffer.
-    """
+    """Yield a file that replaces `path` at the end of the context, or is removed and raises SaveError if that fails."""
     if not writes_here():
         yield io.BytesIO()
         return

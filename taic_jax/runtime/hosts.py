@@ -18,10 +18,8 @@ from jax.experimental import multihost_utils
 
 from taic_jax.config import ConfigError
 
-PATIENCE = 20.0
-"""Seconds in which the first host must answer the others."""
-FOREVER = 10**6
-"""Seconds that JAX waits for the last host; at their end it would print a stack of C++ instead of an error."""
+PATIENCE = 20.0  # seconds for the first host to answer the others
+FOREVER = 10**6  # seconds that JAX waits for the last host; afterwards it prints a stack of C++ instead of an error
 
 
 class Hosts(NamedTuple):

@@ -39,7 +39,9 @@ class RunLogger:
         with writing(run_dir):
             self._events_dir.mkdir(parents=True, exist_ok=True)
         with writing(self._path):
-            _drop_half_row(self._path)
+            if self._path.exists():  # cut the bytes that a killed run left after the last newline
+                with self._path.open("rb+") as file:
+                    file.truncate(file.read().rfind(b"\n") + 1)
         self._open()
         self._display, self._stage = Display(quiet), None
 
@@ -144,13 +146,6 @@ def _histogram(name: str, counts: np.ndarray) -> Any:
 
 def _count(row: Row) -> int:
     return row["ticks"] if "ticks" in row else row["steps"]
-
-
-def _drop_half_row(path: Path) -> None:
-    """Cut the bytes that a killed run left after the last newline."""
-    if path.exists():
-        with path.open("rb+") as file:
-            file.truncate(file.read().rfind(b"\n") + 1)
 
 
 def _mean(value: Any) -> float | None:

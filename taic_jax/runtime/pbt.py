@@ -19,8 +19,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from taic_jax.config import Config, replace
 from taic_jax.nonfinite import FINITE
 
-SHARE = 4
-"""One in so many points is replaced, and one in so many is copied."""
+SHARE = 4  # one in so many points is replaced, and one in so many is copied
 FACTORS = (0.8, 1.25)
 PREFIX, PARENT = "pbt", "pbt/parent"
 
@@ -61,7 +60,10 @@ class Population:
             parent = _parents(score.reshape(-1, self.seeds), key_donor)
             parent = jnp.where(count % self.every == 0, parent, jnp.arange(len(parent)))
             numbers = {f"{PREFIX}/{name}": attrgetter(name)(members.config) for name in self.bounds}
-            after = Members(_take_over(state, parent), self._explore(members.config, parent, key_factor), key, count)
+            # Each row keeps its own keys: children would draw the same numbers.
+            is_key = lambda x: jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+            state = jax.tree.map(lambda x: x if is_key(x) else x[parent], state)
+            after = Members(state, self._explore(members.config, parent, key_factor), key, count)
             return after, metrics | numbers | {PARENT: parent.astype(jnp.float32)}, extra
 
         return call
@@ -91,16 +93,8 @@ def _parents(score: Float[Array, "G K"], key: Key[Array, " R"]) -> Int[Array, " 
     return (jnp.where(worse, donor, point) * seeds + seed).reshape(-1)
 
 
-def _take_over(state: Any, parent: Int[Array, " R"]) -> Any:
-    """Return the parents' states, but each row's own keys, or children would draw the same numbers."""
-    return jax.tree.map(lambda x: x if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x[parent], state)
-
-
 def schedule(rows: list[dict[str, Any]], names: list[str], row: int) -> list[tuple[int, dict[str, float]]]:
-    """Return the history (first tick, values by name) of the numbers behind the weights of one last `row`.
-
-    `rows` are the metrics of stage train, in order, and `names` the dotted names of the numbers.
-    """
+    """Return the history (first tick, values by dotted name) of the numbers behind the weights of one last `row`."""
     steps: list[tuple[int, dict[str, float]]] = []
     for i in reversed(range(len(rows))):
         row = int(rows[i][f"train/{PARENT}"][row])

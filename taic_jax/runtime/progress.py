@@ -9,8 +9,7 @@ from dataclasses import dataclass
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
-INTERVAL = 10.0
-"""Seconds between two lines."""
+INTERVAL = 10.0  # seconds between two lines
 
 
 @dataclass

@@ -16,8 +16,7 @@ from taic_jax.config_io import load_config, to_yaml
 from taic_jax.runtime.files import PARTIAL, SaveError, remove_partial, save_json, save_text, writes_here, writing
 from taic_jax.runtime.hosts import agree
 
-LOCK = ".lock"
-"""File of a run's folder that the process writing there locks."""
+LOCK = ".lock"  # file of a run's folder that the process writing there locks
 
 
 class Statistics(TypedDict):
@@ -134,10 +133,7 @@ class RunFolder:
         return any(path.suffix != PARTIAL and path.name != LOCK for path in self.path.iterdir())
 
     def check(self, config: Config, *, resume: bool = False, overwrite: bool = False) -> None:
-        """Check, without a change, that a run can begin or resume in the folder, or raise RunFolderError.
-
-        Errors are another run in it, and none to resume or overwrite.
-        """
+        """Check, without a change, that a run can begin or resume in the folder, or raise RunFolderError."""
         if resume:
             if not self.begun:
                 raise RunFolderError(f"{self.path} holds no run to resume: no config.yaml in it")

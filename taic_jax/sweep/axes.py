@@ -11,11 +11,9 @@ from taic_jax.config import Config, ConfigError, field_types, replace, walk
 from taic_jax.config_io import from_text, nearest, validate
 
 RANGE = ".."
-STATIC_FLOATS = "env."
-"""Fields that are numbers, but constants of a program: environments are made outside of it."""
+STATIC_FLOATS = "env."  # prefix of numbers that are constants of a program: environments are made outside of it
 
-Point = dict[str, Any]
-"""Values by the dotted names of their fields."""
+Point = dict[str, Any]  # values by the dotted names of their fields
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,10 +46,7 @@ class Axis:
 
 
 def parse_axis(text: str) -> Axis:
-    """Read FIELD=V1,V2,... or FIELD=LOW..HIGH or FIELD=LOW..HIGH:log.
-
-    Raise ConfigError for an unknown field, a value of another type, or an empty interval.
-    """
+    """Read FIELD=V1,V2,... or FIELD=LOW..HIGH or FIELD=LOW..HIGH:log, or raise ConfigError."""
     name, equals, values = text.partition("=")
     kinds, name = field_types(), name.strip().replace("-", "_")
     if name not in kinds or not equals:

@@ -18,18 +18,13 @@ MIB = 2**20
 
 
 def points_that_fit(config: Config, memory: int) -> int:
-    """Return the number of points, each with all seeds, that run in `memory` MiB (0: half of the machine's).
-
-    Raise ConfigError if not even one does.
-    """
+    """Return the number of points, with all seeds, that run in `memory` MiB (0: half of all), or raise ConfigError."""
     limit, used = (memory or machine_memory() // 2) * MIB, psutil.Process().memory_info().rss
     _, source = make_envs(config)
     ticks = experience_ticks(config.collect) if needs_collect(config) else 0
     least = 2 * experience_bytes(source, ticks) * config.seeds
-    if used + least < limit:
-        count = int((limit - used) / (row_bytes(config) * config.seeds))
-        if count:
-            return count
+    if used + least < limit and (count := int((limit - used) / (row_bytes(config) * config.seeds))):
+        return count
     raise ConfigError(
         f"--memory: expected at least {(used + least) // MIB + 1:,} MiB for one point with {config.seeds} seeds, got "
         f"{limit // MIB:,}; fewer seeds or a smaller collect.capacity take less"

@@ -27,10 +27,7 @@ _PROBE = "import ray, sys; ray.init(sys.argv[1], logging_level='ERROR', log_to_d
 
 
 def connect(address: str) -> None:
-    """Connect to a cluster, or start one here for address `local`.
-
-    Raise ConfigError for a cluster that is silent or of another version.
-    """
+    """Connect to a cluster, or start one here for `local`; raise ConfigError for a silent one or another version."""
     if address != LOCAL and (problem := _probe(address)):
         expected = f"expected the HOST:PORT of a Ray cluster, got no answer of {address} {problem}"
         raise ConfigError(f"--cluster: {expected}; {LOCAL} starts one here")
@@ -48,10 +45,7 @@ def _probe(address: str) -> str | None:
 
 
 def run_tasks(work: Callable[..., Any], tasks: Sequence[tuple], signals: Signals | None = None) -> Iterator[Any]:
-    """Yield the results of `work(*task)` in the order in which the tasks end.
-
-    A task takes a whole node of the smallest kind, and runs in this process's folder, which all nodes share.
-    """
+    """Yield the results of `work(*task)` as they come; each takes a node of the smallest kind, in this shared folder."""
     remote: Any = ray.remote(max_retries=RETRIES, scheduling_strategy="SPREAD", **_smallest_node())(_in_folder)
     waiting = [remote.remote(Path.cwd(), work, task) for task in tasks]
     try:

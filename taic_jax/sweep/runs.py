@@ -25,24 +25,20 @@ from taic_jax.sweep.marginals import draw_marginals
 
 PLAN, TABLE, BEST, MARGINALS = "plan.json", "table.csv", "best.yaml", "marginals.png"
 
-TableRow = dict[str, Any]
-"""A row of the table: a point's index and values, seeds, ticks, and statistics of its returns over seeds."""
+TableRow = dict[str, Any]  # a point's index and values, seeds, ticks, and statistics of its returns over seeds
 
 
 @dataclasses.dataclass
 class Plan:
-    """The axes and counts of a sweep, its points [G], and the chunks of their indices, each for one program.
-
-    Optuna's points are added as it suggests them; `trials` are its numbers of them.
-    """
+    """The axes and counts of a sweep, its points [G], and the chunks of their indices, each for one program."""
 
     axes: list[str]
     samples: int
     optuna: int
     size: int
-    points: list[Point]
+    points: list[Point]  # Optuna's are added as it suggests them
     chunks: list[list[int]]
-    trials: list[int] = dataclasses.field(default_factory=list)
+    trials: list[int] = dataclasses.field(default_factory=list)  # Optuna's numbers of the points
     pbt: int = 0
 
     def describe(self, config: Config) -> str:
@@ -70,7 +66,7 @@ def run_sweep(
 ) -> None:
     """Run the missing chunks; write the table after each, and at the end the best point and the marginal plots.
 
-    Raise Interrupted at a signal, and RunFolderError for a folder of another sweep, none to resume, or a busy one.
+    Raise Interrupted at a signal, and RunFolderError as `RunFolder.prepare` and `RunFolder.claimed`.
     """
     config = sweep_config(config)
     if plan.pbt:
@@ -186,10 +182,7 @@ def _batches(
 
 
 def _resume(plan: Plan, run_dir: Path) -> Plan:
-    """Return the folder's plan, or the new one if a sweep was killed before it wrote any.
-
-    Raise RunFolderError without a plan, or for one of other axes.
-    """
+    """Return the folder's plan, or the new one if a sweep was killed before it wrote any, or raise RunFolderError."""
     if {path.name for path in run_dir.iterdir()} == {RunFolder(run_dir).config_path.name, LOCK}:
         return plan
     try:
