@@ -43,7 +43,7 @@ def probability_of_improvement(x: ArrayLike, y: ArrayLike, seed: int = 0) -> tup
 
 
 def stratified_interval(groups: Sequence[ArrayLike], seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Return the 95 % bootstrap interval of the interquartile mean over all groups [K, ...], each resampled by itself."""
+    """Return the 95 % bootstrap interval of the interquartile mean over groups [K, ...], each resampled by itself."""
     arrays = [np.asarray(group, np.float64) for group in groups]
     values, resamples = np.concatenate(arrays), _resamples(np.random.default_rng(seed), *map(len, arrays))
     tail = (1 - 0.95) / 2

@@ -12,7 +12,7 @@ MODES = ("return", "return_mean_option")  # of the policy as it explores, and of
 
 
 def methods_of(run: LoadedRun) -> list[dict[str, Any]]:
-    """Return a row of the table per method, ready for JSON, and per stage that the summary lacks (see docs/report.md)."""
+    """Return a row of the table per method, ready for JSON, and per stage that trained but is in no summary."""
     results = {_stage_of(run, name): _from_summary(method) for name, method in run.methods.items()}
     for stage in run.trained_stages():
         if stage not in results:

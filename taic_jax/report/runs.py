@@ -70,7 +70,7 @@ class LoadedRun:
         return str(self.fields.get("collect.env") or self.task) if stage == COLLECT else self.task
 
     def flat_stage(self) -> str | None:
-        """Return the stage of baseline `flat`: its own, or else collect by the rule of `config.collector_is_baseline`."""
+        """Return the stage of baseline `flat`: its own, or else collect, as in `config.collector_is_baseline`."""
         if self.of_stage("flat"):
             return "flat"
         # By the fields, which a config of another version has, too.

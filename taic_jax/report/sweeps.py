@@ -17,7 +17,7 @@ PER_SEED = ("per_seed", "first_per_seed")
 
 
 def read_sweep(folder: Path, name: str) -> tuple[dict[str, Any], list[LoadedRun]]:
-    """Return a sweep's table and notes, ready for JSON, and its begun points as runs; raise ReportError or ConfigError."""
+    """Return a sweep's table and notes, ready for JSON, and its points as runs, or raise ReportError or ConfigError."""
     try:
         plan = Plan(**json.loads((folder / PLAN).read_text()))
     except (OSError, ValueError, TypeError):

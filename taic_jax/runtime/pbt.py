@@ -61,8 +61,7 @@ class Population:
             parent = jnp.where(count % self.every == 0, parent, jnp.arange(len(parent)))
             numbers = {f"{PREFIX}/{name}": attrgetter(name)(members.config) for name in self.bounds}
             # Each row keeps its own keys: children would draw the same numbers.
-            is_key = lambda x: jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
-            state = jax.tree.map(lambda x: x if is_key(x) else x[parent], state)
+            state = jax.tree.map(lambda x: x if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x[parent], state)
             after = Members(state, self._explore(members.config, parent, key_factor), key, count)
             return after, metrics | numbers | {PARENT: parent.astype(jnp.float32)}, extra
 

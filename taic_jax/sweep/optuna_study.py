@@ -17,7 +17,7 @@ JOURNAL = "optuna.log"
 
 
 class Study:
-    """A study that suggests points from earlier results, the higher the better, also those of a journal in `run_dir`."""
+    """A study that suggests points from earlier results, the higher the better, with a journal in `run_dir`."""
 
     def __init__(self, axes: list[Axis], run_dir: Path, seed: int):
         optuna.logging.set_verbosity(optuna.logging.ERROR)

@@ -45,7 +45,7 @@ def _probe(address: str) -> str | None:
 
 
 def run_tasks(work: Callable[..., Any], tasks: Sequence[tuple], signals: Signals | None = None) -> Iterator[Any]:
-    """Yield the results of `work(*task)` as they come; each takes a node of the smallest kind, in this shared folder."""
+    """Yield the results of `work(*task)` as tasks end; each takes a node of the smallest kind, in this folder."""
     remote: Any = ray.remote(max_retries=RETRIES, scheduling_strategy="SPREAD", **_smallest_node())(_in_folder)
     waiting = [remote.remote(Path.cwd(), work, task) for task in tasks]
     try:
