@@ -100,21 +100,21 @@ def _read_hdf5(path: Path, sizes: tuple[int, int]) -> list[Experience]:
         return [_read_episode(f"{path}: episode_{n}", file[f"episode_{n}"], sizes) for n in numbers]
 
 
-def _read_episode(where: str, group: Any, sizes: tuple[int, int]) -> Experience:
+def _read_episode(label: str, group: Any, sizes: tuple[int, int]) -> Experience:
     if not hasattr(group, "keys"):
-        raise ArtifactError(f"{where}: expected a group, got an array")
-    _require(where, HDF5_NAMES, group.keys())
+        raise ArtifactError(f"{label}: expected a group, got an array")
+    _require(label, HDF5_NAMES, group.keys())
     obs_name, *others = HDF5_NAMES
     obs = group[obs_name]
     if hasattr(obs, "keys"):
-        _require(f"{where}/{obs_name}", ["observation"], obs.keys())
+        _require(f"{label}/{obs_name}", ["observation"], obs.keys())
         obs_name, obs = f"{obs_name}/observation", obs["observation"]
-    return _as_experience(f"{where}/", {obs_name: obs, **{name: group[name] for name in others}}, sizes, num_last=1)
+    return _as_experience(f"{label}/", {obs_name: obs, **{name: group[name] for name in others}}, sizes, num_last=1)
 
 
-def _as_experience(where: str, sources: dict[str, Any], sizes: tuple[int, int], num_last: int = 0) -> Experience:
+def _as_experience(label: str, sources: dict[str, Any], sizes: tuple[int, int], num_last: int = 0) -> Experience:
     """Check and join observations, without the `num_last` after the last tick, actions, rewards and ends, by name."""
-    obs, action, reward, *ends = ((f"{where}{name}", source) for name, source in sources.items())
+    obs, action, reward, *ends = ((f"{label}{name}", source) for name, source in sources.items())
     shape = getattr(action[1], "shape", None)
     count = shape[0] if shape else 0  # the checks refuse any other source
     actions = _numbers(*action, (count, sizes[1]))
@@ -125,40 +125,40 @@ def _as_experience(where: str, sources: dict[str, Any], sizes: tuple[int, int], 
     return Experience(states[:count], actions, rewards, done)
 
 
-def _require(where: str | Path, required: Sequence[str], present: Iterable[str]) -> None:
+def _require(label: str | Path, required: Sequence[str], present: Iterable[str]) -> None:
     names = list(present)
     for name in (name for name in required if name not in names):
         nearest = difflib.get_close_matches(name, names, n=1, cutoff=0.0)
         hint = f"; the nearest name is {nearest[0]!r}" if nearest else ""
-        raise ArtifactError(f"{where}: expected {name} in it, got nothing{hint}")
+        raise ArtifactError(f"{label}: expected {name} in it, got nothing{hint}")
 
 
-def _numbers(where: str, source: Any, shape: tuple[int, ...], longer: bool = False) -> np.ndarray:
+def _numbers(label: str, source: Any, shape: tuple[int, ...], longer: bool = False) -> np.ndarray:
     """Return an array of NumPy or HDF5 as finite float32 of this shape; cut its rows if they may be `longer`."""
     sizes = ", ".join(map(str, shape)) + (" or more" if longer else "")
-    got: tuple[int, ...] = getattr(source, "shape", None) or ()
-    cut = longer and got[:-1] == shape[:-1] and got[-1:] > shape[-1:]
-    if _kind(source) not in "fiub" or not (got == shape or cut):
-        raise ArtifactError(f"{where}: expected numbers [{sizes}], got {_show(source)}")
+    actual: tuple[int, ...] = getattr(source, "shape", None) or ()
+    cut = longer and actual[:-1] == shape[:-1] and actual[-1:] > shape[-1:]
+    if _kind(source) not in "fiub" or not (actual == shape or cut):
+        raise ArtifactError(f"{label}: expected numbers [{sizes}], got {_show(source)}")
     with np.errstate(over="ignore"):  # numbers too large for float32 are counted below
         array = np.asarray(source[..., : shape[-1]]).astype(np.float32)
     if wrong := np.count_nonzero(~np.isfinite(array)):
-        raise ArtifactError(f"{where}: expected finite numbers, got {wrong} of {array.size} that are NaN or infinite")
+        raise ArtifactError(f"{label}: expected finite numbers, got {wrong} of {array.size} that are NaN or infinite")
     return array
 
 
-def _flags(where: str, source: Any, num_ticks: int) -> np.ndarray:
+def _flags(label: str, source: Any, num_ticks: int) -> np.ndarray:
     """Return an array of NumPy or HDF5 as bool [num_ticks]."""
     if _kind(source) != "b" or source.shape != (num_ticks,):
-        raise ArtifactError(f"{where}: expected bool [{num_ticks}], got {_show(source)}")
+        raise ArtifactError(f"{label}: expected bool [{num_ticks}], got {_show(source)}")
     return np.array(source[...])
 
 
-def _in_bounds(where: str, action: np.ndarray) -> np.ndarray:
+def _in_bounds(label: str, action: np.ndarray) -> np.ndarray:
     """Return actions clipped to [-1, 1], which they may exceed by rounding only."""
     largest = action.flat[np.argmax(np.abs(action))]
     if abs(largest) > 1 + TOLERANCE:
-        raise ArtifactError(f"{where}: expected actions in [-1, 1], got {largest:g}: scale them to [-1, 1]")
+        raise ArtifactError(f"{label}: expected actions in [-1, 1], got {largest:g}: scale them to [-1, 1]")
     return np.clip(action, -1, 1)
 
 

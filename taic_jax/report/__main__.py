@@ -31,7 +31,7 @@ class Command:
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Run one command and return its exit code: 0, or 2 for a mistake in what was asked."""
+    """Run one command and return its exit code: 0, or 2 for a mistake in the arguments."""
     return tell(lambda: execute(typed(sys.argv[1:] if args is None else args, PROGRAM, Command)))
 
 

@@ -27,10 +27,10 @@ class LoadedRun:
     name: str  # unique in the report
     folder: Path
     fields: dict[str, Any]  # of config.yaml by their dotted names, as read
-    config: Config | None  # None where it is of another version
+    config: Config | None  # None if it is of another version
     rows: list[Row]
     summary: dict[str, Any] | None  # None while the run is not finished
-    clock: dict[str, Any]  # ticks and seconds so far
+    clock: dict[str, Any]  # seconds, and ticks if any, so far
     notes: tuple[str, ...]  # for the reader: partial, stopped seeds, rows left out
     point: bool = False  # whether it is a point of a sweep
 
@@ -99,7 +99,7 @@ def read_run(folder: Path, name: str = "") -> LoadedRun:
 
 
 def run_of(name: str) -> RunFolder:
-    """Return the folder of the run by its path, or by an artifact's in it."""
+    """Return the folder of a run, by its path or the path of an artifact in it."""
     files = RunFolder(Path(name))
     return files if files.begun else RunFolder(files.path.parent)
 

@@ -31,7 +31,7 @@ Spec = tuple[tuple[int, ...], np.dtype]
 VERSION, CHECKSUMS, LAYOUT = "taic_jax", "crc32", "layout"  # keys of the metadata
 PACKED = "bytes"  # the one array of a checkpoint
 
-# Orbax's threads also log what it raises, in hundreds of lines.
+# Orbax's threads also log its errors, in hundreds of lines.
 logging.getLogger("absl").addFilter(lambda record: "orbax" not in Path(record.pathname).parts)
 
 
@@ -58,19 +58,16 @@ def load_arrays(path: Path) -> dict[str, np.ndarray]:
 
 
 def load_tree(path: Path, like: Tree) -> Tree:
-    """Read a folder of `save_tree` or `Checkpoints` as a tree like `like`, onto its devices, or raise ArtifactError.
-
-    The leaves of `like` are arrays or `jax.ShapeDtypeStruct`s, whose names, shapes and dtypes must be the stored ones.
-    """
+    """Read a tree with the names, shapes, dtypes and devices of `like` (arrays or shapes), or raise ArtifactError."""
     arrays, writer = _read(path)
     named = _by_name(like)
     expected = {name: _spec(leaf) for name, leaf in named.items() if leaf.size}
     stored: dict[str, Spec] = {name: (array.shape, array.dtype) for name, array in arrays.items()}
     for name in {**expected, **stored}:
         if expected.get(name) != stored.get(name):
-            want, got = _show(expected.get(name)), _show(stored.get(name))
+            difference = f"expected {_show(expected.get(name))} at {name or 'the root'}, got {_show(stored.get(name))}"
             by = "" if writer == _version() else f"; taic_jax {writer} wrote it, this is {_version()}"
-            raise ArtifactError(f"{path}: expected {want} at {name or 'the root'}, got {got}{by}")
+            raise ArtifactError(f"{path}: {difference}{by}")
     leaves = [_restore(arrays.get(name), leaf) for name, leaf in named.items()]
     return jax.tree.unflatten(jax.tree.structure(like), leaves)
 

@@ -32,7 +32,7 @@ S = TypeVar("S")
 STAGE_STREAMS = {
     "collect": 0, "learn": 1, "train": 2, "flat": 3, "evaluate": 4, "video": 5, "repeat": 6, "total": 7, "transfer": 8,
 }  # fmt: skip
-"""The stream of random numbers of each stage. A number is never reused: checkpoints of old runs depend on it."""
+"""The stream of random numbers of each stage. A number is never reused: old runs draw from it."""
 # The stages whose results a stage starts from: a seed that stopped there stays stopped.
 BUILDS_ON = {"learn": ("collect",), "train": ("collect", "learn")}
 CHECKPOINT_SECONDS = 30.0
@@ -181,10 +181,8 @@ def _keys(config: Config, points: int = 1) -> jax.Array:
 
 
 def resume(checkpoints: Checkpoints, guard: Guarded) -> tuple[Guarded, int]:
-    """Return the last checkpoint that every host sees, and its step; without one, `guard` and 0.
-
-    Types are never weak, like a checkpoint's: so a start and a resume compile the same program.
-    """
+    """Return the last checkpoint that every host sees, and its step; without one, `guard` and 0."""
+    # A checkpoint's types are never weak: so a start and a resume compile the same program.
     guard = jax.tree.map(
         lambda x: jax.lax.convert_element_type(x, x.dtype) if getattr(x, "weak_type", False) else x, guard
     )
@@ -209,7 +207,6 @@ def drive(
 
     Args:
       run: the run; its `stopped` receives the codes.
-      stage: its name.
       step: (states [K], *args) -> (states, metrics [K] with the codes `nonfinite`, input of `after`).
       state: before the first step; consumed.
       *args: constant arrays.

@@ -91,10 +91,7 @@ def save_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 def json_safe(tree: Any, digits: int | None = None) -> Any:
-    """Return a tree of mappings, sequences, arrays and numbers in JSON's types, with None for numbers not finite.
-
-    Round floats to `digits` significant digits, if any.
-    """
+    """Return a tree of arrays and numbers in JSON's types, rounded to `digits`, if any, with None for NaN and inf."""
     if isinstance(tree, Mapping):
         return {name: json_safe(item, digits) for name, item in tree.items()}
     if hasattr(tree, "tolist"):  # an array, or one of its numbers

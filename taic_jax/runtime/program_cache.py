@@ -36,10 +36,7 @@ def compiler_options() -> dict[str, str | bool]:
 
 
 def _remove_half_written(folder: Path) -> None:
-    """Remove incomplete programs of a full disk or a killed process, which JAX would fail to read ever after.
-
-    JAX writes the time of the last use, in a file of its own, after the program.
-    """
+    """Remove incomplete programs, without JAX's later file of the last use, which JAX would fail to read ever after."""
     for path in folder.glob("*-cache"):
         if not path.with_name(path.name.removesuffix("-cache") + "-atime").exists():
             path.unlink(missing_ok=True)

@@ -18,10 +18,10 @@ class Work:
 
     name: str  # the stage, and its activity if that is not training, as in `train: compiling`
     total: int = 0  # ticks or gradient steps per seed in all; 0 without a measure
-    first: int = 0  # of these, before a resume
-    done: int = 0  # of these, so far
+    first: int = 0  # units before a resume
+    done: int = 0  # units so far
     unit: str = "ticks"
-    seeds: int = 1  # that run side by side
+    seeds: int = 1  # side by side
     result: float | None = None  # mean return
 
     def __post_init__(self):
@@ -57,14 +57,9 @@ class Display:
 
     def __init__(self, quiet: bool):
         self._console = Console(stderr=True, quiet=quiet)
-        self._progress = Progress(
-            TextColumn("{task.description:>20}"),
-            BarColumn(bar_width=24),
-            TextColumn("{task.fields[text]}"),
-            TimeRemainingColumn(),
-            console=self._console,
-            disable=quiet or not self._console.is_terminal,
-        )
+        columns = TextColumn("{task.description:>20}"), BarColumn(bar_width=24), TextColumn("{task.fields[text]}")
+        hidden = quiet or not self._console.is_terminal
+        self._progress = Progress(*columns, TimeRemainingColumn(), console=self._console, disable=hidden)
         self._task: TaskID
         self._work: Work | None = None
         self._begun: set[str] = set()

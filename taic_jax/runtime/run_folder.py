@@ -40,11 +40,11 @@ class Durations(Statistics):
     histogram: list[float | None]
 
 
+# The evaluation of one method.
 Method = TypedDict(
     "Method",
     {"return": Returns, "return_mean_option": Returns, "duration": Durations, "metrics": dict[str, Statistics]},
 )
-"""The evaluation of one method."""
 
 
 class Summary(TypedDict):
@@ -59,8 +59,8 @@ class Summary(TypedDict):
     commit: str | None
 
 
+# A row of metrics.jsonl: `stage`, `ticks` or `steps`, `time`, and each metric, a number or a list over seeds.
 Row = dict[str, Any]
-"""A row of metrics.jsonl: `stage`, `ticks` or `steps`, `time`, and each metric, a number or a list over seeds."""
 
 
 class RunFolderError(ValueError):
@@ -153,10 +153,7 @@ class RunFolder:
                     raise RunFolderError(f"{self.path} {why}, so it is not overwritten")
 
     def prepare(self, config: Config, *, resume: bool = False, overwrite: bool = False) -> None:
-        """Make the folder, or check the one to resume, on the first host for all; raise RunFolderError on every host.
-
-        Beside the errors of `check`, these are a folder that cannot be written, and hosts with different configs.
-        """
+        """Make or check the folder, on the first host for all, or raise RunFolderError on every host."""
         checksum = zlib.crc32(to_yaml(config).encode()) >> 1  # a number of 31 bits
         if agree([checksum]) != agree([checksum], least=True):
             raise RunFolderError("--hosts: expected the same config on every host, got different ones")
@@ -188,8 +185,7 @@ class RunFolder:
     def claimed(self) -> Iterator[None]:
         """Lock the folder in the context, and remove the incomplete files of killed processes.
 
-        The system unlocks it at any end of this process. Raise BusyError while another process has the lock, and
-        RunFolderError if the folder cannot be written.
+        The system unlocks it at any end of this process. Raise BusyError if it is locked, or RunFolderError.
         """
         if not writes_here():
             yield

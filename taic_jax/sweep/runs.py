@@ -190,9 +190,9 @@ def _resume(plan: Plan, run_dir: Path) -> Plan:
     except (OSError, ValueError, TypeError):
         raise RunFolderError(f"{run_dir} holds no sweep to resume: no {PLAN} in it") from None
     for name in ("axes", "samples", "optuna", "pbt"):
-        before, now = getattr(saved, name), getattr(plan, name)
-        if before != now:
-            raise RunFolderError(f"{run_dir} was run with other points: --{name} was {before}, got {now}")
+        old, new = getattr(saved, name), getattr(plan, name)
+        if old != new:
+            raise RunFolderError(f"{run_dir} was run with other points: --{name} was {old}, got {new}")
     return saved
 
 
