@@ -49,7 +49,6 @@ const figure = (title, attributes, ...children) =>
 
 const readout = () => make("p", { class: "readout", "aria-live": "polite" });
 
-function swatch({ dashed, colour }) {
-  return draw("svg", { width: 26, height: 10, "aria-hidden": "true", class: "swatch", style: `--own:${colour}` },
+const swatch = ({ dashed, colour }) =>
+  draw("svg", { width: 26, height: 10, "aria-hidden": "true", class: "swatch", style: `--own:${colour}` },
     draw("line", { class: dashed ? "mean dashed" : "mean", x1: 1, x2: 25, y1: 5, y2: 5 }));
-}

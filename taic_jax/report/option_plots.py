@@ -49,11 +49,8 @@ def option_plot(run: LoadedRun, count: int) -> dict[str, Any]:
         experience, why = _experience(home, config, body), ""
     except (ArtifactError, OSError) as error:
         experience, why = None, f"what they were learnt from is not there: {error}"
-    if experience:
-        picture = _picture(*_window_codes(config, model, experience, count))
-    else:
-        picture = _picture(*_prior_codes(config, model, count))
-    return picture | {"drawn": "windows" if experience else "prior", "why": why}
+    codes = _window_codes(config, model, experience, count) if experience else _prior_codes(config, model, count)
+    return _picture(*codes) | {"drawn": "windows" if experience else "prior", "why": why}
 
 
 def _origin(folder: Path, config: OptionsConfig) -> tuple[Path, OptionsConfig]:

@@ -95,9 +95,8 @@ function choice(label, options, value, chosen) {
   return make("label", { class: "control" }, label, list);
 }
 
-function section(id, title, ...children) {
-  return make("section", { id, "aria-labelledby": id + "-title" }, make("h2", { id: id + "-title", tabindex: -1 }, title), children);
-}
+const section = (id, title, ...children) =>
+  make("section", { id, "aria-labelledby": id + "-title" }, make("h2", { id: id + "-title", tabindex: -1 }, title), children);
 
 // Draw a figure at the width of its place, anew when that or the view changes.
 function onWidth(host, drawAt) {

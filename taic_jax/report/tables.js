@@ -76,9 +76,8 @@ function resultRow(run, method, range) {
 }
 
 // The number, and its interval below it.
-function twoLines(summary) {
-  return [number(summary?.iqm), summary && summary.ci95[0] !== null && make("small", {}, bounds(summary.ci95))];
-}
+const twoLines = (summary) =>
+  [number(summary?.iqm), summary && summary.ci95[0] !== null && make("small", {}, bounds(summary.ci95))];
 
 function strip({ return: { per_seed: seeds, iqm, ci95 }, return_untrained: before }, range, colour) {
   const [width, height] = [170, 26];

@@ -42,7 +42,7 @@ def writes_here() -> bool:
 def atomic_file(path: Path) -> Iterator[BinaryIO]:
     """Yield a file that replaces `path` at the end of the context, or is removed and raises SaveError if that fails."""
     if not writes_here():
-        yield io.BytesIO()
+        yield io.BytesIO()  # goes nowhere
         return
     partial = path.with_name(path.name + PARTIAL)
     with writing(path):
