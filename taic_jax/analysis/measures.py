@@ -239,10 +239,11 @@ def _max_norms(x: ArrayLike, y: ArrayLike, k: int, components: int | None) -> tu
     x, y = _pair(x, y)
     if not 1 <= k < len(x):
         raise ValueError(f"k must be at least 1 and less than the {len(x)} rows, got {k}")
+    projected: np.ndarray = y
     if components is not None:
         centred = y - y.mean(axis=0)
-        y = centred @ np.linalg.svd(centred, full_matrices=False)[2][:components].T
-    return _distances(x, "chebyshev"), _distances(y, "chebyshev")
+        projected = centred @ np.linalg.svd(centred, full_matrices=False)[2][:components].T
+    return _distances(x, "chebyshev"), _distances(projected, "chebyshev")
 
 
 def _kraskov(x_distances: np.ndarray, y_distances: np.ndarray, k: int) -> float:
