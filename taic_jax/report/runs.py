@@ -115,7 +115,7 @@ def check_seeds(run: LoadedRun) -> None:
 
 
 def unique_names(folders: Sequence[Path]) -> list[str]:
-    """Return each folder's shortest unique end of its path, or raise ReportError if a folder is there twice."""
+    """Return the shortest unique end of each folder's path, or raise ReportError if a folder is there twice."""
     paths = [folder.resolve() for folder in folders]
     for path, count in Counter(paths).items():
         if count > 1:
