@@ -95,7 +95,7 @@ def _picture(option: np.ndarray, change: np.ndarray) -> dict[str, Any]:
 
 
 def principal_plane(option: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return codes [N, D] on two principal components [N, 2], of positive largest weight, and the shares of variance."""
+    """Return codes [N, D] on two principal components [N, 2], of positive largest weight, and shares of variance."""
     centred = option - option.mean(axis=0)
     _, scales, axes = np.linalg.svd(centred, full_matrices=False)
     axes = axes * np.sign(axes[np.arange(len(axes)), np.abs(axes).argmax(axis=1)])[:, None]

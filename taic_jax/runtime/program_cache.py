@@ -36,7 +36,7 @@ def compiler_options() -> dict[str, str | bool]:
 
 
 def _remove_half_written(folder: Path) -> None:
-    """Remove incomplete programs, which JAX cannot read: they lack the file of their last use, which it writes later."""
+    """Remove incomplete programs, which JAX cannot read: they lack the file of their last use, written later."""
     for path in folder.glob("*-cache"):
         if not path.with_name(path.name.removesuffix("-cache") + "-atime").exists():
             path.unlink(missing_ok=True)
