@@ -20,7 +20,7 @@ from taic_jax.envs.rendering import write_webp
 from taic_jax.nonfinite import FINITE, QUANTITIES
 from taic_jax.rl.ppo import Agent, num_iterations
 from taic_jax.runtime.driver import Run, Stopped
-from taic_jax.runtime.files import json_safe, whole_file, writes_here
+from taic_jax.runtime.files import atomic_file, json_safe, writes_here
 from taic_jax.runtime.run_folder import Method, Summary
 
 PACKAGES = ("taic_jax", "jax", "jaxlib", "flax", "optax", "brax", "mujoco", "mujoco-mjx", "orbax-checkpoint")
@@ -151,5 +151,5 @@ def write_video(run: Run, env: Env, agent: Agent) -> None:
     agent = jax.device_get(jax.tree.map(lambda x: x[0], agent))
     physics = jax.jit(lambda agent, key: record(env, agent, key, ticks))(agent, run.stage_keys("video")[0])
     frames = env.render(jax.device_get(physics))
-    with whole_file(run.dir / "video.webp") as file:
+    with atomic_file(run.dir / "video.webp") as file:
         write_webp(file, frames, env.dt)

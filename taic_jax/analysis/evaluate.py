@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Key
 
-from taic_jax.envs.base import Env, State
+from taic_jax.envs.base import Env
 from taic_jax.envs.wrappers import AutoReset
 from taic_jax.rl.ppo import Agent
 from taic_jax.rl.rollout import Rollout, count_durations, rollout, start
@@ -17,15 +17,11 @@ from taic_jax.types import Scalar
 def evaluate(env: Env, agent: Agent, key: Key[Array, ""], episodes: int, exploration: Scalar = 1.0) -> dict[str, Array]:
     """Return means over `episodes` whole episodes, one per environment, each from a fresh start.
 
-    Args:
-      env: the task, not yet wrapped to reset itself.
-      agent, episodes: the policy that acts, and in how many episodes.
-      key: consumed.
-      exploration: scale of the policy's noise; 0 takes its mean options.
+    `env` is not wrapped to reset itself. `exploration` scales the policy's noise; 0 takes its mean options.
 
     Returns:
       Scalars: `return`, `length` in ticks, and of every metric of the task its mean over the ticks of an episode
-      (`mean/NAME`) and its value at the last tick (`final/NAME`); and `durations` [L], how many options took
+      (`mean/NAME`) and its value at the last tick (`final/NAME`); and `durations` [L], the counts of options of
       1, 2, ... L ticks.
     """
     ticks = _run(env, agent, key, episodes, env.episode_length, exploration, lambda state: state.metrics)
@@ -47,15 +43,9 @@ def record(env: Env, agent: Agent, key: Key[Array, ""], ticks: int) -> Any:
 
 
 def _run(
-    env: Env,
-    agent: Agent,
-    key: Key[Array, ""],
-    num_envs: int,
-    ticks: int,
-    exploration: Scalar,
-    keep: Callable[[State], Any],
+    env: Env, agent: Agent, key: Key[Array, ""], num_envs: int, ticks: int, exploration: Scalar, extras: Callable
 ) -> Rollout:
     key_start, key_rollout = jax.random.split(key)
     env = AutoReset(env.evaluated)
     running = start(env, agent.executor, num_envs, key_start)
-    return rollout(env, agent.executor, agent.decide(exploration), running, key_rollout, ticks, keep)[1]
+    return rollout(env, agent.executor, agent.decide(exploration), running, key_rollout, ticks, extras)[1]

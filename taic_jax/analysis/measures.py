@@ -1,8 +1,8 @@
-"""Measures of an option space: how much of what an option does can be read from its code, and how smoothly.
+"""Measures of an option space: the information in an option's code about its effects, and its smoothness.
 
-Rows are windows; x [N, D] is the option and y [N, P] the state change, as a rule. All run on the host, and only the
-MLP probe in JAX. Distances between all rows take N^2 numbers of 8 bytes: of more than some 2000 rows draw a sample.
-Shapes that do not fit, too few rows, and rows with a number that is not finite raise ValueError.
+Rows are windows; x [N, D] is the option and y [N, P] the state change, as a rule. Only the MLP probe runs in JAX.
+Distances between all rows take N^2 numbers of 8 bytes: of more than some 2000 rows draw a sample. Shapes that do not
+fit, too few rows, and rows with a number that is not finite raise ValueError.
 """
 
 from typing import Any
@@ -24,21 +24,15 @@ PERMUTATIONS, COMPONENTS = 50, 3
 
 
 def measure_option_space(option: ArrayLike, start: ArrayLike, end: ArrayLike, seed: int = 0) -> dict[str, float]:
-    """Return every measure of N options and of the states in which their windows start and end.
+    """Return every measure of N options [N, D], N >= 25, and of the states [N, P] at the ends of their windows.
 
-    Change (end - start), start and end are each standardised column by column, and a constant column counts for
-    nothing. Distances between options are taken as they are: the prior gives options their scale, and a dimension
-    that the posterior ignores must not be blown up to the size of the others.
+    Change (end - start), start and end are each standardised column by column, and constant columns become 0. Options
+    are not: the prior is their scale, and a dimension that the posterior ignores must not grow to the size of others.
 
     Keys: `distance_correlation` and `trustworthiness` of option and change; `linear_r2/NAME` and `mlp_r2/NAME` of
     change, start and end, each from the option; `mutual_information/change` of the option and the first 3 principal
     components of the change, with `mutual_information/permuted` (mean) and `mutual_information/permuted_upper` (95 %
-    quantile) where the rows of the change are permuted.
-
-    Args:
-        option: [N, D], N at least 25.
-        start, end: [N, P].
-        seed: of the probes' held-out rows, of the MLP and of the permutations.
+    quantile) for permuted rows of the change. `seed` draws the probes' held-out rows, the MLP and the permutations.
     """
     option, start = _pair(option, start, "option", "start")
     end = _finite_rows(end, "end")
@@ -63,8 +57,8 @@ def distance_correlation(x: ArrayLike, y: ArrayLike) -> float:
 
     0 for independent and 1 for similar point clouds (equal up to rotation, shift and one scale). The plain statistic
     of Székely, Rizzo & Bakirov (2007) tends to 1 with the number of columns even for independent ones. The corrected
-    one may fall a little below 0 and therefore has no root: it estimates the square, on the scale of R^2. If all of
-    the at least 4 rows of x or of y are equal, it is 0.
+    one may fall a little below 0, so no root is taken: it estimates the square, on the scale of R^2. It needs 4 rows,
+    and is 0 if all rows of x or of y are equal.
     """
     x, y = _pair(x, y)
     if len(x) < 4:
@@ -75,12 +69,12 @@ def distance_correlation(x: ArrayLike, y: ArrayLike) -> float:
 
 
 def trustworthiness(x: ArrayLike, y: ArrayLike, k: int = 10) -> float:
-    """Return how far neighbours in x are neighbours in y as well (Venna & Kaski, 2001).
+    """Return the degree to which neighbours in x are neighbours in y as well (Venna & Kaski, 2001).
 
     1 - 2 / (N k (2N - 3k - 1)) sum_i sum_{j in U_i} (r(i, j) - k), where U_i holds those of the k rows nearest to i
-    in x that are not among the k nearest in y, and r(i, j) is j's rank from i in y (1 is nearest). 1 says that near
+    in x that are not among the k nearest in y, k < N / 2, and r(i, j) is j's rank from i in y (1 is nearest). At 1 near
     options change the state nearly alike; unrelated x and y give about 0.5. With x and y exchanged it is the
-    continuity: whether near changes come from near options. `k` must be less than N / 2.
+    continuity: at 1 near changes come from near options.
     """
     x, y = _pair(x, y)
     rows = len(x)
@@ -95,11 +89,10 @@ def trustworthiness(x: ArrayLike, y: ArrayLike, k: int = 10) -> float:
 def linear_probe_r2(x: ArrayLike, y: ArrayLike, seed: int = 0) -> float:
     """Return the R^2, on held-out rows, of ridge regression from x to y: a linear probe (Alain & Bengio, 2017).
 
-    A fifth of the rows (N is at least 25), drawn by the seed, is held out. All columns are standardised by mean and
-    standard deviation of the training rows, which are the others, and the penalty is 0.001 per row.
-    R^2 = 1 - sum (y - prediction)^2 / sum y^2, each over all held-out rows and all columns: every column that varies
-    weighs about alike, and predicting the mean of the training rows gives exactly 0. Below 0 is worse than that;
-    nothing is clipped. A constant y gives NaN.
+    A fifth of the rows (N >= 25), drawn by the seed, is held out. All columns are standardised by mean and standard
+    deviation of the other rows, for training, and the penalty is 0.001 per row. R^2 = 1 - sum (y - prediction)^2 /
+    sum y^2, over all held-out rows and columns: varying columns weigh about alike, the mean of the training rows
+    scores exactly 0, worse predictions less, and a constant y NaN.
 
     Rows of one episode are alike: held-out rows from episodes of the training rows flatter a probe.
     """
@@ -113,8 +106,8 @@ def mlp_probe_r2(x: ArrayLike, y: ArrayLike, seed: int = 0) -> float:
     """Return the R^2 of `linear_probe_r2`, on the same held-out rows, of a freshly trained MLP.
 
     It has two hidden layers of 64 and takes 300 steps of Adam on all training rows but a fifth; this fifth chooses
-    the step whose parameters count (early stopping; Prechelt, 1998). An untrained MLP predicts nearly 0, so where x
-    and y are unrelated an early step is chosen, and R^2 is near 0. With a state as y it is F trained anew: it may
+    the step whose parameters predict (early stopping; Prechelt, 1998). An untrained MLP predicts nearly 0, so for
+    unrelated x and y an early step is chosen, and R^2 is near 0. With a state as y it is a newly trained F, and may
     find information that F, trained against a moving encoder, missed.
     """
     x, y, held_out_x, held_out_y = (jnp.asarray(part, jnp.float32) for part in _split(x, y, seed))
@@ -127,15 +120,10 @@ def mutual_information(x: ArrayLike, y: ArrayLike, k: int = 3, components: int |
     """Return the mutual information of x and y in nats, by the first estimator of Kraskov et al. (2004).
 
     Distances are by the maximum norm. The estimate has little bias for few columns; with tens it falls far short of
-    the truth, as the k-th neighbour is then hardly nearer than any other row. `components` answers that: a projection
-    of y shares at most as much with x as y does, so its information is a lower bound, and can be estimated. Strong
-    relations are underestimated too (Gao et al., 2015): no estimate exceeds psi(N) - psi(k), about ln(N / k), but where
-    rows are equal: those bias it upwards.
-
-    Args:
-        x, y: [N, D] and [N, P].
-        k: number of neighbours, less than N; more of them lower the variance and raise the bias.
-        components: project y onto this many of its first principal components; None leaves y whole.
+    the truth, as the k-th neighbour is then hardly nearer than any other row. Therefore y is projected onto so many
+    first principal `components`, if any: their information about x is a lower bound, and can be estimated. Strong
+    relations are underestimated too (Gao et al., 2015): no estimate exceeds psi(N) - psi(k), about ln(N / k), unless
+    equal rows bias it upwards. More neighbours k < N lower the variance and raise the bias.
     """
     return _kraskov(*_max_norms(x, y, k, components), k)
 
@@ -143,10 +131,7 @@ def mutual_information(x: ArrayLike, y: ArrayLike, k: int = 3, components: int |
 def permutation_baseline(
     x: ArrayLike, y: ArrayLike, draws: int = PERMUTATIONS, seed: int = 0, k: int = 3, components: int | None = None
 ) -> tuple[float, float]:
-    """Return mean and 95 % quantile of `mutual_information` over permutations of the rows of y, which share nothing.
-
-    About 5 % of unrelated pairs reach an estimate above the quantile (François et al., 2006).
-    """
+    """Return mean and 95 % quantile of `mutual_information` for permuted rows of y (François et al., 2006)."""
     x_distances, y_distances = _max_norms(x, y, k, components)
     rng = np.random.default_rng(seed)
     orders = (rng.permutation(len(y_distances)) for _ in range(draws))
@@ -155,7 +140,7 @@ def permutation_baseline(
 
 
 def active_dimensions(mean: ArrayLike) -> int:
-    """Return how many dimensions of q(o|a), of means [N, D], vary with the window: Var > 0.01 (Burda et al., 2016)."""
+    """Return the number of dimensions of q(o|a) whose means [N, D] have Var > 0.01 (Burda et al., 2016)."""
     return int(np.sum(np.var(_finite_rows(mean, "mean"), axis=0) > ACTIVE_VARIANCE))
 
 
@@ -187,7 +172,7 @@ def _pair(x: ArrayLike, y: ArrayLike, x_name: str = "x", y_name: str = "y") -> t
 def standardized(values: np.ndarray, reference: np.ndarray) -> np.ndarray:
     """Return values scaled to mean 0 and standard deviation 1 on the reference's rows; constant columns become 0."""
     std = reference.std(axis=0)
-    # Float32 leaves its rounding on a number that physics holds constant; scaled up it would look like a signal.
+    # A constant of the physics varies by float32's rounding, which would look like a signal when scaled up.
     varies = std > 1e-8 + 1e-6 * np.abs(reference).max(axis=0)
     return np.where(varies, (values - reference.mean(axis=0)) / np.where(varies, std, 1.0), 0.0)
 

@@ -1,4 +1,4 @@
-"""Effects of options that are executed from chosen states, and how orderly they make the option space (§4.2.1)."""
+"""Effects of options executed from chosen states, and the order of the option space by these effects (§4.2.1)."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -8,13 +8,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float, Key
 
-from taic_jax.analysis.measures import (
-    active_dimensions,
-    distance_correlation,
-    kl_per_dimension,
-    measure_option_space,
-    standardized,
-)
+from taic_jax.analysis import measures
 from taic_jax.config import OptionsConfig
 from taic_jax.envs.base import Env
 from taic_jax.envs.wrappers import AutoReset
@@ -24,8 +18,7 @@ from taic_jax.options.model import OptionModel
 from taic_jax.rl.rollout import rollout, start
 from taic_jax.types import as_arrays
 
-WARM_UP = 100
-"""Ticks of random options before options are executed from many states, so that these are states options lead to."""
+WARM_UP = 100  # ticks of random options before a measure from many states: these are then states options lead to
 
 
 class Effects(struct.PyTreeNode):
@@ -40,10 +33,9 @@ class Effects(struct.PyTreeNode):
 def execute(
     env: Env, executor: Executor, option: Float[Array, "N D"], key: Key[Array, ""], many: bool = False
 ) -> Effects:
-    """Execute each option once, until its termination rule or the episode ends it.
+    """Execute each option once in `env`, not wrapped to reset itself, until its rule or the episode ends it.
 
     With `many`, each begins in another state, reached by random options; else all begin in the same first state.
-    `env` is the task, not yet wrapped to reset itself; the key is consumed.
     """
     key_start, key_warm_up, key_noise = jax.random.split(key, 3)
     env, num_options = AutoReset(env), len(option)
@@ -65,23 +57,23 @@ def _from_prior(obs: Float[Array, "B S"], noise: Float[Array, "B D"]) -> tuple[A
 
 
 def always(option: Float[Array, "B D"], obs: Float[Array, "B S"], noise: Array) -> tuple[Array, Array]:
-    """Decide on these options whatever is observed: with them, a `DecideFn`."""
+    """Decide on these options for any observation: with them bound, a `DecideFn`."""
     return option, jnp.zeros(len(option))
 
 
 def order(env: Env, config: OptionsConfig, model: OptionModel, key: Key[Array, ""], count: int = 500) -> float:
-    """Return the distance correlation of options from the prior and of the change that each causes in one state."""
+    """Return the distance correlation of options from the prior and the changes they cause in one state."""
     key_prior, key_run = jax.random.split(key)
     executor = make_executor(as_arrays(config), model)
     option = jax.random.normal(key_prior, (count, executor.option_size))
     run = jax.jit(execute, static_argnums=0)  # one program for all models
     effects = jax.device_get(run(env, executor, option, key_run))
     change = effects.end - effects.start
-    return distance_correlation(effects.option, standardized(change, change))
+    return measures.distance_correlation(effects.option, measures.standardized(change, change))
 
 
-class Encoded(struct.PyTreeNode):
-    """N windows of the experience: mean and log standard deviation of q(o|a), and the states at both ends."""
+class WindowCodes(struct.PyTreeNode):
+    """Codes of N windows, mean and log standard deviation of q(o|a), and the states at the windows' ends."""
 
     mean: Array
     log_std: Array
@@ -95,30 +87,24 @@ def encode_windows(
     experience: Experience | Sequence[Experience],
     key: Key[Array, ""],
     count: int,
-) -> Encoded:
-    """Encode `count` windows drawn from the selection, of `config.length` ticks each."""
+) -> WindowCodes:
+    """Encode `count` windows of `config.length` ticks, drawn from the selection."""
     dataset = make_dataset(experience, config)
     drawn = jax.random.randint(key, (count,), 0, dataset.count)
     windows = gather(dataset, drawn, jnp.full(count, config.length), config.length)
     means, log_stds = jax.vmap(model.encode)(windows.actions)
-    return Encoded(means[:, -1], log_stds[:, -1], windows.states[:, 0], windows.states[:, -1])
+    return WindowCodes(means[:, -1], log_stds[:, -1], windows.states[:, 0], windows.states[:, -1])
 
 
 def measure(
     env: Env, config: OptionsConfig, model: OptionModel, experience: Experience, key: Key[Array, ""], count: int = 1000
 ) -> dict[str, float]:
-    """Measure one option model: the effects of options drawn from the prior and from data, from one state and many.
-
-    Args:
-      env: the task they are executed in.
-      config, model, experience: of one seed: the model, and what it was learnt with and from.
-      key: consumed.
-      count: options of each kind, N.
+    """Measure one seed's option model by N = `count` options from the prior and from data, from one state and many.
 
     Returns:
       Every measure of `measure_option_space` and the mean duration `ticks` under `prior|data/one|many/NAME`; the
-      measures of the windows with the states they were recorded in under `window/NAME`; and `active_dimensions` and
-      `kl`, in nats, of the windows' codes.
+      measures of the windows with their recorded states under `window/NAME`; and `active_dimensions` and `kl`, in
+      nats, of the windows' codes.
     """
     config = as_arrays(config)
     key_prior, key_windows, key_data, *keys = jax.random.split(key, 7)
@@ -129,15 +115,15 @@ def measure(
     executor = make_executor(config, model)
     run = jax.jit(partial(execute, env), static_argnames="many")
     result = {
-        "active_dimensions": float(active_dimensions(windows.mean)),
-        "kl": float(kl_per_dimension(windows.mean, windows.log_std).sum()),
+        "active_dimensions": float(measures.active_dimensions(windows.mean)),
+        "kl": float(measures.kl_per_dimension(windows.mean, windows.log_std).sum()),
     }
-    measured = measure_option_space(data, windows.start, windows.end)
+    measured = measures.measure_option_space(data, windows.start, windows.end)
     result |= {f"window/{name}": value for name, value in measured.items()}
     cases = [(kind, option, many) for kind, option in (("prior", prior), ("data", data)) for many in (False, True)]
     for (kind, option, many), key_run in zip(cases, keys, strict=True):
         effects = jax.device_get(run(executor, option, key_run, many=many))
-        measured = measure_option_space(effects.option, effects.start, effects.end)
+        measured = measures.measure_option_space(effects.option, effects.start, effects.end)
         measured["ticks"] = float(effects.ticks.mean())
         # From one state the start is constant, and the end is the change.
         names = [name for name in measured if many or not name.endswith(("/start", "/end"))]

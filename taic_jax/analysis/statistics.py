@@ -14,12 +14,7 @@ BOOTSTRAP_DRAWS = 2000
 
 
 def iqm(values: ArrayLike, axis: int = -1) -> Any:
-    """Return the interquartile mean: the mean without the lowest and the highest quarter.
-
-    Args:
-        values: [..., K]. One that is not finite (a seed that diverged) is not trimmed: the result is NaN.
-        axis: the axis of the seeds.
-    """
+    """Return the mean over seeds without the lowest and the highest quarter; NaN if a seed's value is not finite."""
     values = np.asarray(values, np.float64)
     finite = np.isfinite(values)
     trimmed = stats.trim_mean(np.where(finite, values, 0.0), 0.25, axis=axis)
@@ -27,17 +22,12 @@ def iqm(values: ArrayLike, axis: int = -1) -> Any:
 
 
 def bootstrap_interval(values: ArrayLike, seed: int = 0, confidence: float = 0.95) -> tuple[float, float]:
-    """Return the percentile bootstrap interval of the interquartile mean.
-
-    Args:
-        values: [K], one per seed. One value alone tells nothing about its spread: the interval is NaN.
-        seed: of the resampling; the same seed gives the same interval.
-        confidence: probability mass of the interval.
-    """
+    """Return the percentile bootstrap interval of the interquartile mean of values [K]; NaN for one value alone."""
     values = np.asarray(values, np.float64)
     if values.size < 2:
         return float("nan"), float("nan")
-    low, high = _interval(iqm(values[_resamples(np.random.default_rng(seed), values.size)]), (1 - confidence) / 2)
+    draws, tail = iqm(values[_resamples(np.random.default_rng(seed), values.size)]), (1 - confidence) / 2
+    low, high = np.quantile(draws, [tail, 1 - tail])
     return float(low), float(high)
 
 
@@ -47,32 +37,24 @@ def probability_of_improvement(x: ArrayLike, y: ArrayLike, seed: int = 0) -> tup
     wins = np.sign(x[:, None] - y[None]) / 2 + 0.5
     random = np.random.default_rng(seed)
     rows, columns = _resamples(random, len(x)), _resamples(random, len(y))
-    low, high = _interval([wins[np.ix_(i, j)].mean() for i, j in zip(rows, columns, strict=True)], 0.025)
+    draws = [wins[np.ix_(i, j)].mean() for i, j in zip(rows, columns, strict=True)]
+    low, high = np.quantile(draws, [0.025, 1 - 0.025])
     return float(wins.mean()), (float(low), float(high))
 
 
 def stratified_interval(groups: Sequence[ArrayLike], seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Return the 95 % bootstrap interval of the interquartile mean over all groups, each resampled by itself.
-
-    Args:
-        groups: [K, ...] each, one row per seed; a group is a task, or else must not lend seeds to another.
-        seed: of the resampling.
-    """
+    """Return the 95 % bootstrap interval of the interquartile mean over groups [K, ...], each resampled by itself."""
     arrays = [np.asarray(group, np.float64) for group in groups]
     values, resamples = np.concatenate(arrays), _resamples(np.random.default_rng(seed), *map(len, arrays))
-    low, high = _interval([iqm(values[rows], axis=0) for rows in resamples], (1 - 0.95) / 2)
+    tail = (1 - 0.95) / 2
+    low, high = np.quantile([iqm(values[rows], axis=0) for rows in resamples], [tail, 1 - tail], axis=0)
     return low, high
 
 
 def _resamples(random: np.random.Generator, *sizes: int) -> np.ndarray:
-    """Draw rows with replacement, each group's from its own: indices [draws, sum of sizes] into all rows."""
+    """Draw each group's rows from its own with replacement: indices [draws, sum of sizes] into all rows."""
     starts = np.repeat(np.cumsum([0, *sizes[:-1]]), sizes)
     return starts + random.integers(np.repeat(sizes, sizes), size=(BOOTSTRAP_DRAWS, sum(sizes)))
-
-
-def _interval(draws: Any, tail: float) -> np.ndarray:
-    """Return the quantiles of draws [draws, ...] that cut off `tail` at either end."""
-    return np.quantile(draws, [tail, 1 - tail], axis=0)
 
 
 def exact_interval(count: int, total: int) -> tuple[float, float]:
@@ -90,8 +72,7 @@ def holm(p_values: ArrayLike) -> np.ndarray:
 
 
 def summarize(per_seed: ArrayLike) -> Statistics:
-    """Return the values [K], their mean, interquartile mean and 95 % interval; None is what is not finite."""
+    """Return the values [K], their mean, interquartile mean and 95 % interval, with None for numbers not finite."""
     values = np.asarray(per_seed, np.float64)
-    return json_safe(
-        {"per_seed": values, "mean": values.mean(), "iqm": iqm(values), "ci95": bootstrap_interval(values)}
-    )
+    summary = {"per_seed": values, "mean": values.mean(), "iqm": iqm(values), "ci95": bootstrap_interval(values)}
+    return json_safe(summary)

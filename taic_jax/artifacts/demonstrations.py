@@ -1,7 +1,4 @@
-"""Demonstrations: what others recorded, read as one column of experience.
-
-Two layouts are read: a NumPy file of flat arrays, and Minari's HDF5 (docs/demonstrations.md).
-"""
+"""Demonstrations of others as one column of experience, from NumPy's or Minari's files (docs/demonstrations.md)."""
 
 import contextlib
 import difflib
@@ -18,7 +15,7 @@ from taic_jax.envs.errors import MissingExtraError
 from taic_jax.options.dataset import Experience
 from taic_jax.runtime.checkpoint import ArtifactError
 
-TOLERANCE = 1e-3  # how far an action may stand outside [-1, 1] and is clipped; farther, its scale is another
+TOLERANCE = 1e-3  # actions are clipped if they exceed [-1, 1] by at most this; beyond, they have another scale
 HDF5_SUFFIXES = (".hdf5", ".h5")
 SUPPORTED = "an .npz file, an .hdf5 file, or a Minari dataset's folder with data_format hdf5"
 MAIN_FILE = "main_data.hdf5"
@@ -30,20 +27,19 @@ EPISODE = re.compile("episode_(0|[1-9][0-9]*)")
 def read_demonstrations(path: Path, proprioceptive_size: int, action_size: int) -> Experience:
     """Read recorded episodes as experience [T, 1, ...]: one after another, in NumPy float32 and bool.
 
-    `done` is true at every episode's last tick, whether or not the recording says so. Observations may have more
-    than P = `proprioceptive_size` entries, of which the first P are taken: they must stand in the task's own order.
-    Actions are in [-1, 1], as the task takes them.
+    `done` is true at every episode's last tick, also if the recording omits it. Of longer observations the first
+    P = `proprioceptive_size` entries are taken: they must be in the task's own order. Actions are in [-1, 1].
 
     Layouts:
-      `.npz`: flat arrays `obs` [N, P or more], `action` [N, A], `reward` [N] and `done` [N] bool, which is true at
-        the tick after which an episode ended; the last tick ends one in any case. Other arrays are ignored.
+      `.npz`: flat arrays `obs` [N, P or more], `action` [N, A], `reward` [N] and `done` [N] bool, true at an episode's
+        last tick. Other arrays are ignored.
       Minari: the dataset's folder, its `data` folder or the `.hdf5` file, with groups `episode_0`, `episode_1`, ...
-        of `observations` [n+1, P or more], `actions` [n, A], `rewards`, `terminations` and `truncations` [n]. Where
+        of `observations` [n+1, P or more], `actions` [n, A], `rewards`, `terminations` and `truncations` [n]. If
         `observations` is a group, its entry `observation` is taken. Needs h5py.
 
     Raises:
-      ArtifactError: nothing is there, it has another layout, sizes disagree, a number is not finite, an action is
-        beyond [-1, 1], or h5py is missing.
+      ArtifactError: the path holds nothing, another layout, sizes that disagree, a number that is not finite, or an
+        action beyond [-1, 1], or h5py is missing.
     """
     with _reading(path):
         path = _find_file(path)
@@ -61,7 +57,7 @@ def read_demonstrations(path: Path, proprioceptive_size: int, action_size: int) 
 
 
 def _find_file(path: Path) -> Path:
-    """Return the file that holds the arrays: `path` itself, or Minari's main file in the folder `path`."""
+    """Return the file with the arrays: `path` itself, or Minari's main file in the folder `path`."""
     if not path.exists():
         raise ArtifactError(f"{path}: expected demonstrations, got nothing")
     if not path.is_dir():
@@ -104,26 +100,23 @@ def _read_hdf5(path: Path, sizes: tuple[int, int]) -> list[Experience]:
         return [_read_episode(f"{path}: episode_{n}", file[f"episode_{n}"], sizes) for n in numbers]
 
 
-def _read_episode(where: str, group: Any, sizes: tuple[int, int]) -> Experience:
+def _read_episode(label: str, group: Any, sizes: tuple[int, int]) -> Experience:
     if not hasattr(group, "keys"):
-        raise ArtifactError(f"{where}: expected a group, got an array")
-    _require(where, HDF5_NAMES, group.keys())
+        raise ArtifactError(f"{label}: expected a group, got an array")
+    _require(label, HDF5_NAMES, group.keys())
     obs_name, *others = HDF5_NAMES
     obs = group[obs_name]
     if hasattr(obs, "keys"):
-        _require(f"{where}/{obs_name}", ["observation"], obs.keys())
+        _require(f"{label}/{obs_name}", ["observation"], obs.keys())
         obs_name, obs = f"{obs_name}/observation", obs["observation"]
-    return _as_experience(f"{where}/", {obs_name: obs, **{name: group[name] for name in others}}, sizes, num_last=1)
+    return _as_experience(f"{label}/", {obs_name: obs, **{name: group[name] for name in others}}, sizes, num_last=1)
 
 
-def _as_experience(where: str, sources: dict[str, Any], sizes: tuple[int, int], num_last: int = 0) -> Experience:
-    """Check and join arrays by name: observations, actions, rewards, and all that mark an end.
-
-    The `num_last` observations after the last tick start no tick, and are left out.
-    """
-    obs, action, reward, *ends = ((f"{where}{name}", source) for name, source in sources.items())
+def _as_experience(label: str, sources: dict[str, Any], sizes: tuple[int, int], num_last: int = 0) -> Experience:
+    """Check and join observations, without the `num_last` after the last tick, actions, rewards and ends, by name."""
+    obs, action, reward, *ends = ((f"{label}{name}", source) for name, source in sources.items())
     shape = getattr(action[1], "shape", None)
-    count = shape[0] if shape else 0  # of what is no array, the checks refuse anything
+    count = shape[0] if shape else 0  # the checks refuse any other source
     actions = _numbers(*action, (count, sizes[1]))
     states = _numbers(*obs, (count + num_last, sizes[0]), longer=True)
     rewards = _numbers(*reward, (count,))
@@ -132,46 +125,45 @@ def _as_experience(where: str, sources: dict[str, Any], sizes: tuple[int, int], 
     return Experience(states[:count], actions, rewards, done)
 
 
-def _require(where: str | Path, required: Sequence[str], present: Iterable[str]) -> None:
+def _require(label: str | Path, required: Sequence[str], present: Iterable[str]) -> None:
     names = list(present)
     for name in (name for name in required if name not in names):
         nearest = difflib.get_close_matches(name, names, n=1, cutoff=0.0)
         hint = f"; the nearest name is {nearest[0]!r}" if nearest else ""
-        raise ArtifactError(f"{where}: expected {name} in it, got nothing{hint}")
+        raise ArtifactError(f"{label}: expected {name} in it, got nothing{hint}")
 
 
-def _numbers(where: str, source: Any, shape: tuple[int, ...], longer: bool = False) -> np.ndarray:
-    """Return an array of NumPy or HDF5 as finite float32 of this shape; its rows may be `longer`, and are cut."""
+def _numbers(label: str, source: Any, shape: tuple[int, ...], longer: bool = False) -> np.ndarray:
+    """Return an array of NumPy or HDF5 as finite float32 of this shape; cut its rows if they may be `longer`."""
     sizes = ", ".join(map(str, shape)) + (" or more" if longer else "")
-    got: tuple[int, ...] = getattr(source, "shape", None) or ()
-    cut = longer and got[:-1] == shape[:-1] and got[-1:] > shape[-1:]
-    if _kind(source) not in "fiub" or not (got == shape or cut):
-        raise ArtifactError(f"{where}: expected numbers [{sizes}], got {_show(source)}")
-    with np.errstate(over="ignore"):  # what is too large for float32 is counted below
+    actual: tuple[int, ...] = getattr(source, "shape", None) or ()
+    cut = longer and actual[:-1] == shape[:-1] and actual[-1:] > shape[-1:]
+    if _kind(source) not in "fiub" or not (actual == shape or cut):
+        raise ArtifactError(f"{label}: expected numbers [{sizes}], got {_show(source)}")
+    with np.errstate(over="ignore"):  # numbers too large for float32 are counted below
         array = np.asarray(source[..., : shape[-1]]).astype(np.float32)
-    wrong = np.count_nonzero(~np.isfinite(array))
-    if wrong:
-        raise ArtifactError(f"{where}: expected finite numbers, got {wrong} of {array.size} that are NaN or infinite")
+    if wrong := np.count_nonzero(~np.isfinite(array)):
+        raise ArtifactError(f"{label}: expected finite numbers, got {wrong} of {array.size} that are NaN or infinite")
     return array
 
 
-def _flags(where: str, source: Any, num_ticks: int) -> np.ndarray:
+def _flags(label: str, source: Any, num_ticks: int) -> np.ndarray:
     """Return an array of NumPy or HDF5 as bool [num_ticks]."""
     if _kind(source) != "b" or source.shape != (num_ticks,):
-        raise ArtifactError(f"{where}: expected bool [{num_ticks}], got {_show(source)}")
+        raise ArtifactError(f"{label}: expected bool [{num_ticks}], got {_show(source)}")
     return np.array(source[...])
 
 
-def _in_bounds(where: str, action: np.ndarray) -> np.ndarray:
-    """Return actions clipped to [-1, 1], of which they may stand out by rounding only."""
+def _in_bounds(label: str, action: np.ndarray) -> np.ndarray:
+    """Return actions clipped to [-1, 1], which they may exceed by rounding only."""
     largest = action.flat[np.argmax(np.abs(action))]
     if abs(largest) > 1 + TOLERANCE:
-        raise ArtifactError(f"{where}: expected actions in [-1, 1], got {largest:g}: scale them to [-1, 1]")
+        raise ArtifactError(f"{label}: expected actions in [-1, 1], got {largest:g}: scale them to [-1, 1]")
     return np.clip(action, -1, 1)
 
 
 def _kind(source: Any) -> str:
-    """Return the letter of an array's dtype, as NumPy has them, or a blank for a group."""
+    """Return the letter of an array's dtype in NumPy, or a blank for a group."""
     return source.dtype.kind if hasattr(source, "dtype") else " "
 
 
@@ -183,7 +175,7 @@ def _show(source: Any) -> str:
 
 @contextlib.contextmanager
 def _reading(path: Path) -> Iterator[None]:
-    """Turn whatever reading raises into one line."""
+    """Turn any error of reading into one line."""
     try:
         yield
     except ArtifactError:

@@ -1,7 +1,7 @@
-"""Experience: flat PPO's training trajectories, on disk as one file per iteration, bounded in number.
+"""Experience: flat PPO's training trajectories, on disk as a bounded number of files, one per iteration.
 
-A file holds the newest T ticks of every environment and seed, so a run that is killed loses at most the
-iteration it was in, and a resumed one writes the same files again.
+A file holds the T ticks of one iteration, of every environment and seed: a killed run loses at most one iteration, and
+a resumed one writes the same files again.
 """
 
 import dataclasses
@@ -24,22 +24,22 @@ from taic_jax.options.execution import IdentityExecutor
 from taic_jax.rl import ppo
 from taic_jax.rl.rollout import Rollout
 from taic_jax.runtime.checkpoint import ArtifactError
-from taic_jax.runtime.files import DESCRIPTION, save_description, whole_file, writing
+from taic_jax.runtime.files import DESCRIPTION, atomic_file, save_description, writing
 from taic_jax.types import as_arrays
 
 EXPERIENCE = "experience"
 
 
 def as_experience(ticks: Rollout, proprioceptive_size: int) -> Experience:
-    """Keep what option learning needs of a rollout."""
+    """Return the part of a rollout that option learning needs."""
     done = ticks.terminated | ticks.truncated
     return Experience(ticks.obs[..., :proprioceptive_size], ticks.action, ticks.reward, done)
 
 
 def collect(config: CollectConfig, env: Env, key: Key[Array, ""]) -> tuple[ppo.Agent, dict[str, Array], Experience]:
-    """Train flat PPO in `env` and keep its ticks, or the newest `config.capacity`; pure, so keys may be vmapped.
+    """Train flat PPO in `env`; pure, so keys may be vmapped.
 
-    Returns the agent, the metrics of every iteration, and the experience [T, B, ...].
+    Return the agent, the metrics of every iteration, and the newest experience [T, B, ...], within the capacity.
     """
     config = as_arrays(config)
     executor = IdentityExecutor(env.action_size)
@@ -51,7 +51,7 @@ def collect(config: CollectConfig, env: Env, key: Key[Array, ""]) -> tuple[ppo.A
         return state, (metrics, as_experience(ticks, env.proprioceptive_size) if keep else None)
 
     state, metrics = ppo.init(config.ppo, env, executor, key), []
-    if late < count:  # what is too early to be kept
+    if late < count:  # iterations before the experience
         state, (early, _) = jax.lax.scan(partial(step, False), state, None, count - late)
         metrics.append(early)
     state, (last, blocks) = jax.lax.scan(partial(step, True), state, None, late)
@@ -61,7 +61,7 @@ def collect(config: CollectConfig, env: Env, key: Key[Array, ""]) -> tuple[ppo.A
 
 
 def num_blocks(config: CollectConfig) -> int:
-    """Return how many iterations' worth of experience is kept, at least one."""
+    """Return the number of iterations in the experience, at least one."""
     return max(experience_ticks(config) // (config.ppo.num_envs * config.ppo.rollout_length), 1)
 
 
@@ -71,13 +71,7 @@ def experience_bytes(env: Env, ticks: int) -> int:
 
 
 class ExperienceStore:
-    """A folder of blocks [K, T, B, ...]; the oldest block goes when `capacity` blocks are there.
-
-    Args:
-      folder: made if missing.
-      capacity: number of blocks kept.
-      description: what the experience is of; saved beside the blocks as JSON.
-    """
+    """A folder, made if missing, of the latest `capacity` blocks [K, T, B, ...] and their description."""
 
     def __init__(self, folder: Path, capacity: int, description: dict):
         self.folder, self.capacity = folder, capacity
@@ -86,24 +80,16 @@ class ExperienceStore:
         save_description(folder, description)
 
     def write(self, iteration: int, block: Experience) -> None:
-        """Save the block of one iteration, whole or not at all, and drop the block that no longer fits.
-
-        Raises:
-          SaveError: it cannot be written.
-        """
+        """Save the block of one iteration atomically, or raise SaveError, and drop the oldest beyond the capacity."""
         path = self.folder / f"{iteration:06d}.npz"
-        with whole_file(path) as file:
+        with atomic_file(path) as file:
             np.savez(file, **vars(block))
         with writing(path):
             (self.folder / f"{iteration - self.capacity:06d}.npz").unlink(missing_ok=True)
 
 
 def read_experience(folder: Path, seed: int) -> Experience:
-    """Return all blocks of one seed in time order: [T, B, ...] NumPy arrays.
-
-    Raises:
-      ArtifactError: if there is no block, or one cannot be read.
-    """
+    """Return one seed's blocks in time order as NumPy arrays [T, B, ...], or raise ArtifactError."""
     paths = sorted(folder.glob("[0-9]*.npz"))
     if not paths:
         raise ArtifactError(f"{folder} holds no experience: no file like 000000.npz in it")
@@ -118,12 +104,9 @@ def read_experience(folder: Path, seed: int) -> Experience:
 
 
 def gather_experience(source: Path, env: Env | Body, seeds: int) -> Experience:
-    """Return [K, T, B, ...] of what a run collected, or of demonstrations, for the body of `env`.
+    """Return the experience [K, T, B, ...] of a run, or demonstrations, for the body of `env`, or raise ArtifactError.
 
     Seed k takes the run's seed k modulo their number; demonstrations are every seed's.
-
-    Raises:
-      ArtifactError: nothing readable is there, or it is of another body.
     """
     folder = source / EXPERIENCE if (source / EXPERIENCE).is_dir() else source
     if not (folder / DESCRIPTION).is_file():

@@ -1,7 +1,4 @@
-"""What a run leaves for others: its option models and its flat policies, described so that misuse is refused.
-
-An artifact is a folder: the tree of arrays with leading axis K (one per seed), and `description.json`.
-"""
+"""Artifacts of a run for other runs: folders of its option models or flat policies [K], and `description.json`."""
 
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,14 +17,12 @@ from taic_jax.runtime.files import DESCRIPTION, read_description, save_descripti
 
 OPTIONS, POLICY = "options", "policy"
 
-# What a frozen option model must agree in with the config that uses it: shapes, and how its parts are read.
-STRUCTURE = (
-    "decoder", "size", "length", "termination", "hidden_size", "mlp_sizes", "decoder_sizes",
-)  # fmt: skip
+# The fields in which a frozen option model must agree with the config that uses it: its shapes and their meaning.
+STRUCTURE = ("decoder", "size", "length", "termination", "hidden_size", "mlp_sizes", "decoder_sizes")
 
 
 class Body(NamedTuple):
-    """What an artifact says of the environment it was made in: enough to read it without that environment."""
+    """The environment of an artifact by its description: enough to read the artifact without the environment."""
 
     name: str
     proprioception: str
@@ -35,12 +30,8 @@ class Body(NamedTuple):
     action_size: int
 
 
-def described_body(folder: Path) -> Body:
-    """Return the body that an artifact was made for, by its own description.
-
-    Raises:
-      ArtifactError: it has none.
-    """
+def read_body(folder: Path) -> Body:
+    """Return the body in an artifact's description, or raise ArtifactError without one."""
     description = read_description(folder) or {}
     try:
         return Body(description["env"], *(description[name] for name in Body._fields[1:]))
@@ -49,7 +40,7 @@ def described_body(folder: Path) -> Body:
 
 
 def describe(env: Env | Body) -> dict[str, Any]:
-    """Return what decides whether a body is the same: the name and size of its slice, and its actions."""
+    """Return the description of a body: the name and size of its slice, and the number of its actions."""
     return {
         "env": env.name,
         "proprioception": getattr(env, "proprioception", env.name),
@@ -59,11 +50,7 @@ def describe(env: Env | Body) -> dict[str, Any]:
 
 
 def check_description(folder: Path, kind: str, env: Env | Body, structure: dict[str, Any]) -> dict[str, Any]:
-    """Return the description of an artifact, if it is of the body of `env` and of this structure.
-
-    Raises:
-      ArtifactError: there is none, or it is of another body or structure; the message names the first difference.
-    """
+    """Return an artifact's description, or raise ArtifactError at its first difference from this body and structure."""
     description = read_description(folder)
     if description is None:
         raise ArtifactError(f"{folder}: expected a run that got this far, or its {kind}; got none")
@@ -79,29 +66,25 @@ def check_description(folder: Path, kind: str, env: Env | Body, structure: dict[
 
 
 def save_options(folder: Path, model: OptionModel, env: Env, config: OptionsConfig) -> None:
-    """Save the option models [K] learnt in `env` as the artifact `folder`."""
+    """Save option models [K] of `env` as the artifact `folder`."""
     _save(folder, model, describe(env) | _structure(config) | {"seeds": len(model.delta)})
 
 
 def load_options(source: Path, env: Env | Body, config: OptionsConfig, seeds: int) -> OptionModel:
-    """Load option models [seeds] from a run or an artifact; seed k takes the model k modulo their number.
-
-    Raises:
-      ArtifactError: nothing is there, or it was made for another body or with another structure.
-    """
+    """Load option models [seeds] from a run or an artifact, or raise ArtifactError; seed k takes model k modulo K."""
     folder = source / OPTIONS if (source / OPTIONS).is_dir() else source
     description = check_description(folder, "option model", env, _structure(config))
-    return _load(folder, description["seeds"], seeds, lambda: _empty_model(config, env))
+
+    def empty() -> OptionModel:
+        networks = make_networks(config, env.proprioceptive_size, env.action_size)
+        params, zeros = init_params(networks, config, jax.random.key(0)), jnp.zeros(env.proprioceptive_size)
+        return OptionModel(params, Scale(zeros, zeros), Scale(zeros, zeros), jnp.zeros(()), networks)
+
+    return _load(folder, description["seeds"], seeds, empty)
 
 
 def _structure(config: OptionsConfig) -> dict[str, Any]:
     return {f"options.{name}": getattr(config, name) for name in STRUCTURE}
-
-
-def _empty_model(config: OptionsConfig, env: Env | Body) -> OptionModel:
-    networks = make_networks(config, env.proprioceptive_size, env.action_size)
-    params, zeros = init_params(networks, config, jax.random.key(0)), jnp.zeros(env.proprioceptive_size)
-    return OptionModel(params, Scale(zeros, zeros), Scale(zeros, zeros), jnp.zeros(()), networks)
 
 
 def save_policy(folder: Path, agent: Agent, env: Env) -> None:
@@ -115,13 +98,9 @@ def save_policy(folder: Path, agent: Agent, env: Env) -> None:
 
 
 def load_policy(source: Path, env: Env, config: PPOConfig, seeds: int) -> tuple[PolicyParams, normalize.Statistics]:
-    """Load flat policies [seeds] that a run on another task of the same body made, fitted to the observations of `env`.
+    """Load flat policies [seeds] of a run on another task of the same body, or raise ArtifactError.
 
-    Input weights are carried over entry by entry of the proprioceptive slice; the entries that only `env` has get
-    zero weights, and statistics that start afresh.
-
-    Raises:
-      ArtifactError: nothing is there, or it was made for another body or with other layers.
+    Input weights of the proprioceptive slice are copied; other observations of `env` get zeros and new statistics.
     """
     folder = source / POLICY
     structure = {"hidden_sizes": list(config.hidden_sizes)}
@@ -139,7 +118,7 @@ def load_policy(source: Path, env: Env, config: PPOConfig, seeds: int) -> tuple[
 def _fit(
     params: PolicyParams, statistics: normalize.Statistics, shared: int, size: int
 ) -> tuple[PolicyParams, normalize.Statistics]:
-    """Carry the first `shared` of a policy's inputs over to `size` inputs."""
+    """Copy the weights of the first `shared` inputs of a policy into one of `size` inputs."""
 
     def widen(layers: dict) -> dict:
         first = layers["params"]["Dense_0"]
@@ -157,5 +136,4 @@ def _save(folder: Path, tree: Any, description: dict[str, Any]) -> None:
 
 def _load(folder: Path, saved: int, seeds: int, empty: Any) -> Any:
     like = jax.tree.map(lambda x: jax.ShapeDtypeStruct((saved, *x.shape), x.dtype), jax.eval_shape(empty))
-    which = jnp.arange(seeds) % saved
-    return jax.tree.map(lambda x: x[which], load_tree(folder, like))
+    return jax.tree.map(lambda x: x[jnp.arange(seeds) % saved], load_tree(folder, like))

@@ -31,16 +31,12 @@ class Command:
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Run one command and return its exit code: 0, or 2 for a mistake in what was asked."""
+    """Run one command and return its exit code: 0, or 2 for a mistake in the arguments."""
     return tell(lambda: execute(typed(sys.argv[1:] if args is None else args, PROGRAM, Command)))
 
 
 def execute(command: Command) -> int:
-    """Write the page and print its path.
-
-    Raises:
-      ConfigError: an argument is not valid.
-    """
+    """Write the page and print its path, or raise ConfigError for an invalid argument."""
     if not command.runs:
         raise ConfigError("RUNS: expected at least one folder of a run, got none")
     for name, value, least in (("points", command.points, 2), ("options", command.options, 0)):

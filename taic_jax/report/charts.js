@@ -1,8 +1,8 @@
-// What charts share: a frame that maps values to pixels, its grid, ticks and labels, and the readout.
+// Parts of charts: a frame that maps values to pixels, its grid, ticks and labels, and the readout.
 
 const MARGIN = { left: 58, right: 20, top: 10, bottom: 42 };
 
-// The ranges [low, high] of x and y on so many pixels; y is of logarithms where `log`.
+// The ranges [low, high] of x and y on a number of pixels; with `log`, y is of logarithms.
 function frameOf(width, height, x, y, log = false, margin = MARGIN) {
   const [inner, tall] = [width - margin.left - margin.right, height - margin.top - margin.bottom];
   return {
@@ -27,9 +27,9 @@ function axes({ width, height, inner, left, right, top, bottom, toX, toY }, x, y
     yLabel && draw("text", { class: "label", transform: `translate(12 ${(top + bottom) / 2}) rotate(-90)`, "text-anchor": "middle" }, yLabel)];
 }
 
-// About so many round numbers within [low, high], each with its text.
-function ticks([low, high], wanted, text) {
-  const raw = (high - low) / wanted || 1;
+// About `amount` round numbers within [low, high], each with its text.
+function ticks([low, high], amount, text) {
+  const raw = (high - low) / amount || 1;
   const power = 10 ** Math.floor(Math.log10(raw));
   const step = [1, 2, 2.5, 5, 10].map((m) => m * power).find((s) => s >= raw * 0.999);
   const first = Math.ceil(low / step - 1e-9);
@@ -37,22 +37,18 @@ function ticks([low, high], wanted, text) {
   return values.map((value) => [value, text(value)]);
 }
 
-// The index of the one of so many things that is nearest, by its distance.
+// The index below `length` with the least distance.
 function nearest(length, distance) {
   let best = 0;
   for (let i = 1; i < length; i++) if (distance(i) < distance(best)) best = i;
   return best;
 }
 
-function figure(title, attributes, ...children) {
-  return make("figure", { class: "chart", ...attributes }, make("figcaption", {}, title), children);
-}
+const figure = (title, attributes, ...children) =>
+  make("figure", { class: "chart", ...attributes }, make("figcaption", {}, title), children);
 
-function readout() {
-  return make("p", { class: "readout", "aria-live": "polite" });
-}
+const readout = () => make("p", { class: "readout", "aria-live": "polite" });
 
-function swatch({ dashed, colour }) {
-  return draw("svg", { width: 26, height: 10, "aria-hidden": "true", class: "swatch", style: `--own:${colour}` },
+const swatch = ({ dashed, colour }) =>
+  draw("svg", { width: 26, height: 10, "aria-hidden": "true", class: "swatch", style: `--own:${colour}` },
     draw("line", { class: dashed ? "mean dashed" : "mean", x1: 1, x2: 25, y1: 5, y2: 5 }));
-}

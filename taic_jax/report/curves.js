@@ -96,11 +96,9 @@ function curveAxes(shown, frame) {
   return axes(frame, ticks(frame.x, frame.width < 500 ? 3 : 6, short), y, label);
 }
 
-function drawable(value, frame) {
-  return value !== null && (!frame.log || value > 0);
-}
+const drawable = (value, frame) => value !== null && (!frame.log || value > 0);
 
-// A path along the values, or around the area between them and others; what is missing is not bridged.
+// A path along the values, or around the area between them and others; missing values leave gaps.
 function path(x, values, frame, others) {
   const stretches = [];
   values.forEach((value, i) => {
@@ -123,18 +121,18 @@ function curvePaths({ x, iqm, low, high, seeds, stage }, frame) {
     line(stage.dashed ? "mean dashed" : "mean", path(x, iqm, frame))];
 }
 
-// What the curves are at x: marks in the chart, and values in words.
+// The values of the curves at x: marks in the chart, and a text.
 function showReading(x, shown, frame, cross, values) {
-  const there = shown.filter((s) => x >= s.x[0] && x <= s.x.at(-1)).map((s) => ({ ...s, i: nearest(s.x.length, (i) => Math.abs(s.x[i] - x)) }));
-  const dots = there.filter((s) => drawable(s.iqm[s.i], frame)).map((s) => draw("circle", {
+  const near = shown.filter((s) => x >= s.x[0] && x <= s.x.at(-1)).map((s) => ({ ...s, i: nearest(s.x.length, (i) => Math.abs(s.x[i] - x)) }));
+  const dots = near.filter((s) => drawable(s.iqm[s.i], frame)).map((s) => draw("circle", {
     cx: frame.toX(s.x[s.i]), cy: frame.toY(s.iqm[s.i]), r: 4, style: `--own:${s.stage.colour}`,
   }));
   cross.replaceChildren(draw("line", { x1: frame.toX(x), x2: frame.toX(x), y1: frame.top, y2: frame.bottom }), ...dots);
-  values.replaceChildren(make("b", {}, `${count(x)}: `), ...there.map(({ stage, name, iqm, low, high, i }) =>
+  values.replaceChildren(make("b", {}, `${count(x)}: `), ...near.map(({ stage, name, iqm, low, high, i }) =>
     make("span", { class: "value" }, swatch(stage), `${name} ${number(iqm[i])}`, low[i] !== null && ` (${bounds([low[i], high[i]])})`)));
 }
 
-// A chart that draws series on a frame, and lets one read and zoom them; drawn anew, it keeps the keyboard's focus.
+// A chart that draws series on a frame, with readout and zoom; it keeps the keyboard's focus when drawn anew.
 function curveChart(task, values) {
   let shown, frame, steps, at, from;
   const cross = draw("g", { class: "cross" });
@@ -151,7 +149,7 @@ function curveChart(task, values) {
     if (low <= first && high >= last) whole();
     else if (ends[0] < ends[1]) changeSetting("zoom", task, ends.map((x) => Number(x.toPrecision(6))));
   };
-  const scale = (factor) => { // the span, around what is read
+  const scale = (factor) => { // the span, around the reading
     const middle = at < 0 ? (frame.x[0] + frame.x[1]) / 2 : steps[at];
     const half = factor * (frame.x[1] - frame.x[0]) / 2;
     zoom(middle - half, middle + half);

@@ -9,20 +9,19 @@ from taic_jax.config import COLLECT, METHOD_LABELS
 from taic_jax.report.runs import LoadedRun, ReportError, per_seed, read_run, run_of
 from taic_jax.runtime.files import json_safe
 
-DIGITS = 5
-"""Significant digits of what is drawn."""
+DIGITS = 5  # significant, of curves
 LABELS = METHOD_LABELS | {"train": METHOD_LABELS["taic"], "learn": "learning of options"}
 
 
 def label_of(run: LoadedRun, stage: str) -> str:
-    """Return what a stage trains, in words."""
+    """Return the name of a stage's method in words."""
     if stage == COLLECT:
         return LABELS["flat"] if run.flat_stage() == COLLECT else "flat PPO (collector)"
     return LABELS.get(stage, stage)
 
 
 def stage_curves(run: LoadedRun, stage: str, points: int) -> dict[str, Any]:
-    """Return all curves of one stage, ready for JSON: at most so many iterations, as `thinned` chooses."""
+    """Return all curves of one stage, ready for JSON, at the iterations that `thinned` chooses."""
     rows = run.of_stage(stage)
     drawn = [rows[i] for i in thinned(len(rows), points)]
     unit = "ticks" if "ticks" in drawn[0] else "steps"
@@ -42,10 +41,9 @@ def thinned(count: int, points: int) -> list[int]:
 
 
 def pretraining(run: LoadedRun, stage: str, above: tuple[str, ...] = ()) -> tuple[int, list[str]]:
-    """Return the interactions per seed spent before a stage on what it builds on, and what could not be counted.
+    """Return the interactions per seed of the runs that a stage builds on but those `above`, and unreadable runs.
 
-    Options build on the experience they were learnt from; baseline `transfer` on the source run's policy. Names of
-    the runs that led here are `above`, and none of these is counted again.
+    Options build on the experience for learning them; baseline `transfer` on the source run's policy.
     """
     source = str(run.fields.get("options.source") or "")
     if stage == "transfer":
@@ -60,7 +58,7 @@ def pretraining(run: LoadedRun, stage: str, above: tuple[str, ...] = ()) -> tupl
 
 
 def _spent_in(name: str, stage: str, above: tuple[str, ...]) -> tuple[int, list[str]]:
-    """Return the ticks another run spent in stage collect, or before stage train; its name if they cannot be read."""
+    """Return the ticks of another run in stage collect, or before stage train, or 0 and its name if unreadable."""
     try:
         other = read_run(run_of(name).path)
     except ReportError:
@@ -71,10 +69,7 @@ def _spent_in(name: str, stage: str, above: tuple[str, ...]) -> tuple[int, list[
 
 
 def _over_seeds(values: list[np.ndarray | None]) -> dict[str, Any] | None:
-    """Return every seed's curve, the interquartile mean and its 95 % interval; None where nothing is a number.
-
-    As in the summary, there are no statistics over the other seeds where one has no number.
-    """
+    """Return every seed's curve, and iqm and 95 % interval of iterations where all seeds have one; None without any."""
     width = max((len(value) for value in values if value is not None), default=0)
     table = np.array([np.full(width, np.nan) if value is None else value for value in values])
     if not np.isfinite(table).any():
@@ -84,7 +79,7 @@ def _over_seeds(values: list[np.ndarray | None]) -> dict[str, Any] | None:
 
 
 def _interval(values: np.ndarray) -> tuple[float, float]:
-    """Return the bootstrap interval, at once where the values do not vary, as those of many metrics."""
+    """Return the bootstrap interval, at once for equal values, as of many metrics."""
     if len(values) > 1 and (values == values[0]).all():
         return values[0], values[0]
     return bootstrap_interval(values)

@@ -1,4 +1,4 @@
-"""The option space of a run, for a picture: codes on their first two principal components, and what they change."""
+"""The option space of a run, for a picture: codes on two principal components, and the changes they cause."""
 
 import contextlib
 from functools import partial
@@ -11,7 +11,7 @@ import numpy as np
 
 from taic_jax.analysis.option_space import encode_windows
 from taic_jax.artifacts.experience import gather_experience
-from taic_jax.artifacts.models import OPTIONS, Body, described_body, load_options
+from taic_jax.artifacts.models import OPTIONS, Body, load_options, read_body
 from taic_jax.config import COLLECT, ConfigError, OptionsConfig
 from taic_jax.options.dataset import Experience
 from taic_jax.options.model import OptionModel
@@ -22,11 +22,11 @@ from taic_jax.types import as_arrays
 
 
 def option_plot(run: LoadedRun, count: int) -> dict[str, Any]:
-    """Return the picture of the first seed's option model, ready for JSON, or why there is none.
+    """Return the picture of the first seed's option model, ready for JSON, or the reason against one.
 
-    The options are the means of q(o|a) over windows drawn from what the model was learnt from, coloured by the change
-    of state these windows recorded. Without that experience they are drawn from the prior, coloured by the change
-    that P predicts from the mean state. With a count of 0 the picture is left out.
+    The options are the means of q(o|a) over windows of the model's experience, coloured by the change of state in these
+    windows. Without experience they are drawn from the prior, coloured by the change that P predicts from the mean
+    state. A count of 0 omits the picture.
     """
     if not count:
         return {"missing": "left out by --options 0"}
@@ -38,9 +38,9 @@ def option_plot(run: LoadedRun, count: int) -> dict[str, Any]:
     folder = source / OPTIONS if (source / OPTIONS).is_dir() else source
     if folder == run.folder:
         return {"missing": "options are not learnt yet"}
-    home, config = _learnt_in(run.folder, run.config.options)
+    home, config = _origin(run.folder, run.config.options)
     try:
-        body = described_body(folder)
+        body = read_body(folder)
         models = load_options(folder, body, config, 1)
     except ArtifactError as error:
         return {"missing": str(error)}
@@ -49,15 +49,12 @@ def option_plot(run: LoadedRun, count: int) -> dict[str, Any]:
         experience, why = _experience(home, config, body), ""
     except (ArtifactError, OSError) as error:
         experience, why = None, f"what they were learnt from is not there: {error}"
-    if experience:
-        codes, drawn = _encoded(config, model, experience, count), "windows"
-    else:
-        codes, drawn = _from_prior(config, model, count), "prior"
-    return _picture(*codes) | {"drawn": drawn, "why": why}
+    codes = _window_codes(config, model, experience, count) if experience else _prior_codes(config, model, count)
+    return _picture(*codes) | {"drawn": "windows" if experience else "prior", "why": why}
 
 
-def _learnt_in(folder: Path, config: OptionsConfig) -> tuple[Path, OptionsConfig]:
-    """Return the run whose experience the options of a run were learnt from, and how they were."""
+def _origin(folder: Path, config: OptionsConfig) -> tuple[Path, OptionsConfig]:
+    """Return the run whose experience the options of a run were learnt from, and the config of that learning."""
     if not config.source:
         return folder, config
     home = run_of(config.source)
@@ -67,25 +64,21 @@ def _learnt_in(folder: Path, config: OptionsConfig) -> tuple[Path, OptionsConfig
 
 
 def _experience(folder: Path, config: OptionsConfig, body: Body) -> list[Experience]:
-    """Return the first seed's experience that options were learnt from.
-
-    Raises:
-      ArtifactError, OSError: it is not there.
-    """
+    """Return the first seed's experience behind the options, or raise ArtifactError or OSError."""
     sources = [folder if name == COLLECT else Path(name) for name in config.experience or (COLLECT,)]
     return [jax.tree.map(lambda x: x[0], gather_experience(source, body, 1)) for source in sources]
 
 
-def _encoded(
+def _window_codes(
     config: OptionsConfig, model: OptionModel, experience: list[Experience], count: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the codes [N, D] of windows and the changes [N, P] they recorded."""
+    """Return the codes [N, D] of windows and the changes [N, P] in them."""
     encode = jax.jit(encode_windows, static_argnums=4)
     windows = jax.device_get(encode(as_arrays(config), model, experience, jax.random.key(0), count))
     return windows.mean, windows.end - windows.start
 
 
-def _from_prior(config: OptionsConfig, model: OptionModel, count: int) -> tuple[np.ndarray, np.ndarray]:
+def _prior_codes(config: OptionsConfig, model: OptionModel, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Return codes [N, D] drawn from the prior and the changes [N, P] that P predicts from the mean state."""
     option = jax.random.normal(jax.random.key(0), (count, config.size))
     predict = partial(model.predict, jnp.zeros(model.state_size))
@@ -94,7 +87,7 @@ def _from_prior(config: OptionsConfig, model: OptionModel, count: int) -> tuple[
 
 
 def _picture(option: np.ndarray, change: np.ndarray) -> dict[str, Any]:
-    """Project codes on their principal components, and say how well these two tell each coordinate's change."""
+    """Project codes on two principal components, and add the R^2 of each coordinate's change by these."""
     plane, shares = principal_plane(option)
     r2 = [_r2(plane, column) for column in change.T]
     picture = json_safe({"shares": shares, "changes": change.T, "r2": r2}, 3)
@@ -102,20 +95,17 @@ def _picture(option: np.ndarray, change: np.ndarray) -> dict[str, Any]:
 
 
 def principal_plane(option: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return codes [N, D] in the plane [N, 2] of their first two principal components, and the variance these hold.
-
-    A space of one dimension has nothing in the second; signs are such that the largest weight is positive.
-    """
+    """Return codes [N, D] on two principal components [N, 2], of positive largest weight, and shares of variance."""
     centred = option - option.mean(axis=0)
     _, scales, axes = np.linalg.svd(centred, full_matrices=False)
     axes = axes * np.sign(axes[np.arange(len(axes)), np.abs(axes).argmax(axis=1)])[:, None]
     plane, shares = centred @ axes[:2].T, scales**2 / max((scales**2).sum(), np.finfo(float).tiny)
-    missing = max(2 - plane.shape[1], 0)
+    missing = max(2 - plane.shape[1], 0)  # codes of one dimension get zeros as the second
     return np.pad(plane, ((0, 0), (0, missing))), np.pad(shares[:2], (0, missing))
 
 
 def _r2(plane: np.ndarray, change: np.ndarray) -> float:
-    """Return the share of a coordinate's change that is linear in the plane; NaN where it never changes."""
+    """Return the share of a coordinate's change that is linear in the plane; NaN for a constant one."""
     total = ((change - change.mean()) ** 2).sum()
     if total < 1e-12 * len(change):
         return float("nan")

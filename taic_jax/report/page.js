@@ -5,14 +5,10 @@ window.addEventListener("error", (event) => { document.body.dataset.errors = eve
 
 const data = JSON.parse(document.getElementById("data").textContent);
 
-// Make an element; text is set as text, so nothing in a run's config or name can become markup.
-function make(name, attributes, ...children) {
-  return fill(document.createElement(name), attributes, children);
-}
-
-function draw(name, attributes, ...children) {
-  return fill(document.createElementNS("http://www.w3.org/2000/svg", name), attributes, children);
-}
+// Make an element; text stays text, so that no config or name of a run becomes markup.
+const make = (name, attributes, ...children) => fill(document.createElement(name), attributes, children);
+const SVG = "http://www.w3.org/2000/svg";
+const draw = (name, attributes, ...children) => fill(document.createElementNS(SVG, name), attributes, children);
 
 function fill(element, attributes, children) {
   for (const [name, value] of Object.entries(attributes)) {
@@ -23,9 +19,7 @@ function fill(element, attributes, children) {
   return element;
 }
 
-function unique(values) {
-  return [...new Set(values)];
-}
+const unique = (values) => [...new Set(values)];
 
 // ---- numbers
 
@@ -38,13 +32,8 @@ function number(x, digits = 4) {
   return x < 0 ? "\u2212" + text : text;
 }
 
-function count(x) {
-  return Number.isFinite(x) ? Math.round(x).toLocaleString("fr") : "–"; // thin spaces between thousands
-}
-
-function percent(share, digits) {
-  return number(100 * share, digits) + " %";
-}
+const count = (x) => (Number.isFinite(x) ? Math.round(x).toLocaleString("fr") : "–"); // thin spaces between thousands
+const percent = (share, digits) => number(100 * share, digits) + " %";
 
 // Ticks of an axis: 250 k, 1 M.
 function short(x) {
@@ -57,9 +46,7 @@ function extent(values) {
   return finite.length ? finite.reduce(([low, high], x) => [Math.min(low, x), Math.max(high, x)], [Infinity, -Infinity]) : null;
 }
 
-function bounds([low, high]) {
-  return low === null ? "" : `${number(low)} … ${number(high)}`;
-}
+const bounds = ([low, high]) => (low === null ? "" : `${number(low)} … ${number(high)}`);
 
 // ---- the view's state: #metric=entropy&x=all&seeds=off, so that any view is a link
 
@@ -77,13 +64,11 @@ function change(changes) {
   const changed = Object.entries(view).filter(([name, value]) => value !== DEFAULTS[name]);
   try {
     history.replaceState(null, "", changed.length ? "#" + new URLSearchParams(changed) : location.pathname + location.search);
-  } catch { /* some viewers of files refuse it; the view changes all the same */ }
+  } catch { /* some viewers of files refuse it */ }
   redraw();
 }
 
-function redraw() {
-  for (const one of redraws) one();
-}
+const redraw = () => { for (const one of redraws) one(); };
 
 // Settings that one field of the address holds for many drawings: "a:1,b:2".
 function settings(name) {
@@ -110,9 +95,8 @@ function choice(label, options, value, chosen) {
   return make("label", { class: "control" }, label, list);
 }
 
-function section(id, title, ...children) {
-  return make("section", { id, "aria-labelledby": id + "-title" }, make("h2", { id: id + "-title", tabindex: -1 }, title), children);
-}
+const section = (id, title, ...children) =>
+  make("section", { id, "aria-labelledby": id + "-title" }, make("h2", { id: id + "-title", tabindex: -1 }, title), children);
 
 // Draw a figure at the width of its place, anew when that or the view changes.
 function onWidth(host, drawAt) {

@@ -1,4 +1,4 @@
-"""One self-contained page: everything collected, and the style and the script that draw it, in one HTML file."""
+"""One self-contained HTML file: the data of runs, and the style and the script that draw it."""
 
 import base64
 import dataclasses
@@ -25,7 +25,7 @@ GENERATOR = '<meta name="generator" content="taic_jax.report">'
 
 @dataclasses.dataclass(frozen=True)
 class Detail:
-    """How much of the runs a page holds."""
+    """The amount of detail of a page."""
 
     points: int = 300  # of a curve at most
     options: int = 1000  # in the picture of an option space; 0 leaves these pictures out
@@ -33,15 +33,10 @@ class Detail:
 
 
 def write_report(folders: Sequence[Path], out: Path, detail: Detail = Detail()) -> None:
-    """Write the report on runs and sweeps to `out`, whole or not at all.
-
-    Raises:
-      ReportError: one of them cannot be reported on, or `out` is a file that is no report.
-    """
+    """Write the report on runs and sweeps to `out`, atomically, or raise ReportError; replace no other file."""
     if out.is_dir():
-        raise ReportError(
-            f"--out: expected a file to write, got the folder {out}; the nearest is {out / 'report.html'}"
-        )
+        nearest = out / "report.html"
+        raise ReportError(f"--out: expected a file to write, got the folder {out}; the nearest is {nearest}")
     if out.exists() and GENERATOR not in out.read_text(errors="replace")[:1000]:
         raise ReportError(f"--out: {out} is there and is no report, so it is not replaced; name another file")
     if not out.parent.is_dir():
@@ -50,7 +45,7 @@ def write_report(folders: Sequence[Path], out: Path, detail: Detail = Detail()) 
 
 
 def collect(folders: Sequence[Path], detail: Detail = Detail()) -> dict[str, Any]:
-    """Return everything a page shows of runs and sweeps, ready for JSON; a sweep's points are runs."""
+    """Return the data of a page on runs and sweeps, ready for JSON; a sweep's points are runs."""
     runs, sweeps = [], []
     for folder, name in zip(folders, unique_names(folders), strict=True):
         if (folder / PLAN).is_file():
@@ -71,7 +66,7 @@ def collect(folders: Sequence[Path], detail: Detail = Detail()) -> dict[str, Any
 
 
 def render(data: dict[str, Any]) -> str:
-    """Return the page that shows `data`; no text in it can end the script element that holds it."""
+    """Return the page on `data`, escaped so that no text ends the script element around it."""
     files = resources.files("taic_jax.report")
     names = ", ".join(run["name"] for run in data["runs"])
     parts = {
@@ -89,21 +84,17 @@ def _collect_run(run: LoadedRun, detail: Detail) -> dict[str, Any]:
     video = run.folder / "video.webp"
     shows = detail.videos and not run.point and video.is_file()
     return {
-        "name": run.name,
-        "folder": str(run.folder),
-        "facts": facts_of(run),
-        "notes": list(run.notes),
-        "methods": methods_of(run),
-        "histograms": histograms_of(run),
+        "name": run.name, "folder": str(run.folder), "facts": facts_of(run), "notes": list(run.notes),
+        "methods": methods_of(run), "histograms": histograms_of(run),
         "stages": [stage_curves(run, stage, detail.points) for stage in run.stages()],
         "options": option_plot(run, detail.options),
         "video": f"data:image/webp;base64,{base64.b64encode(video.read_bytes()).decode()}" if shows else None,
         "config": run.fields,
-    }
+    }  # fmt: skip
 
 
 def _differences(runs: Sequence[LoadedRun]) -> list[str]:
-    """Note what keeps runs from being compared number by number."""
+    """Return notes on every difference that bars a comparison of numbers."""
     finished = [run.summary for run in runs if run.summary]
     versions = [summary["versions"] for summary in finished if summary.get("versions")]
     values = {
@@ -113,8 +104,8 @@ def _differences(runs: Sequence[LoadedRun]) -> list[str]:
     }
     for name in dict.fromkeys(name for of_run in versions for name in of_run):
         values[f"version of {name}"] = [str(of_run.get(name)) for of_run in versions]
-    different = {what: list(dict.fromkeys(texts)) for what, texts in values.items() if len(set(texts)) > 1}
     return [
-        f"the runs differ in {what}: {', '.join(texts)}".replace("None", "not recorded")
-        for what, texts in different.items()
+        f"the runs differ in {name}: {', '.join(dict.fromkeys(texts))}".replace("None", "not recorded")
+        for name, texts in values.items()
+        if len(set(texts)) > 1
     ]

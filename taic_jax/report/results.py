@@ -1,4 +1,4 @@
-"""What each method reached: returns before and after training, durations, and what they cost."""
+"""Results of each method: returns before and after training, durations, and cost."""
 
 from typing import Any
 
@@ -8,22 +8,17 @@ from taic_jax.analysis.statistics import summarize
 from taic_jax.report.curves import label_of, pretraining
 from taic_jax.report.runs import LoadedRun, per_seed
 
-MODES = ("return", "return_mean_option")
-"""Returns of the policy as it explores, and of its mean options."""
+MODES = ("return", "return_mean_option")  # of the policy as it explores, and of its mean options
 
 
 def methods_of(run: LoadedRun) -> list[dict[str, Any]]:
-    """Return a row of the table per method, ready for JSON.
-
-    A stage that is evaluated but in no summary (a collector on another task, a run that is not finished) is a row too,
-    and so is one that has not come to its evaluation.
-    """
-    reached = {_stage_of(run, name): _from_summary(method) for name, method in run.methods.items()}
+    """Return a row of the table per method, ready for JSON, and per stage that trained but is in no summary."""
+    results = {_stage_of(run, name): _from_summary(method) for name, method in run.methods.items()}
     for stage in run.trained_stages():
-        if stage not in reached:
-            reached[stage] = _from_evaluation(run, stage)
+        if stage not in results:
+            results[stage] = _from_evaluation(run, stage)
     rows = []
-    for stage, statistics in reached.items():
+    for stage, statistics in results.items():
         ticks, uncounted = pretraining(run, stage)
         rows.append({
             "stage": stage, "label": label_of(run, stage), "task": run.task_of(stage), "evaluated": bool(statistics),
@@ -37,7 +32,7 @@ def _stage_of(run: LoadedRun, method: str) -> str:
 
 
 def _from_summary(method: dict[str, Any]) -> dict[str, Any]:
-    """Summarise the numbers per seed anew, in the one way that also serves a part of the seeds."""
+    """Summarise the numbers per seed anew, which also serves a part of the seeds."""
     result = {mode: summarize(method[mode]["per_seed"]) for mode in (*MODES, "duration") if mode in method}
     if "first_per_seed" in method["return"]:
         result["return_untrained"] = summarize(method["return"]["first_per_seed"])
@@ -45,13 +40,13 @@ def _from_summary(method: dict[str, Any]) -> dict[str, Any]:
 
 
 def _from_evaluation(run: LoadedRun, stage: str) -> dict[str, Any]:
-    """Return what the rows of stage evaluate say of a stage: no summary holds it."""
+    """Return the results of a stage without a summary, from the rows of stage evaluate."""
     values = ((mode, per_seed(row, f"evaluate/{stage}/{mode}")) for row in run.of_stage("evaluate") for mode in MODES)
     return {mode: summarize(x) for mode, x in values if x is not None}
 
 
 def histograms_of(run: LoadedRun) -> list[dict[str, Any]]:
-    """Return for each method whose options may last longer than a tick the share of those that took 1..L ticks."""
+    """Return the shares of options of 1..L ticks for each method whose options may last longer than a tick."""
     shares = {_stage_of(run, name): x.get("duration", {}).get("histogram", []) for name, x in run.methods.items()}
     result = [(stage, share, "evaluation after training") for stage, share in shares.items() if len(share) > 1]
     if not result:
@@ -64,7 +59,7 @@ def histograms_of(run: LoadedRun) -> list[dict[str, Any]]:
 
 
 def _last_counts(run: LoadedRun, stage: str) -> np.ndarray:
-    """Return how many options took 1..L ticks in the newest iteration that counted them, over all seeds."""
+    """Return the number of options of 1..L ticks in the newest iteration that counted them, over all seeds."""
     for row in reversed(run.of_stage(stage)):
         counts = row.get(f"{stage}/durations")
         if counts and isinstance(counts[0], list):
@@ -73,7 +68,7 @@ def _last_counts(run: LoadedRun, stage: str) -> np.ndarray:
 
 
 def facts_of(run: LoadedRun) -> dict[str, Any]:
-    """Return what was run, where and at what cost."""
+    """Return the task, the versions, the machine and the cost of a run."""
     summary = run.summary or {}
     seconds = summary.get("seconds") or run.clock
     return {

@@ -1,4 +1,4 @@
-"""What a run's folder holds, read without trust: config, rows, summary, and what is wrong with them."""
+"""The contents of a run's folder, read without trust: config, rows, summary, and notes on their faults."""
 
 import contextlib
 import dataclasses
@@ -17,7 +17,7 @@ from taic_jax.runtime.run_folder import Row, RunFolder
 
 
 class ReportError(ValueError):
-    """What is given cannot be reported on."""
+    """Input that cannot be reported on."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,22 +26,22 @@ class LoadedRun:
 
     name: str  # unique in the report
     folder: Path
-    fields: dict[str, Any]  # everything in config.yaml by its dotted name, as read
-    config: Config | None  # None where it is of another version
+    fields: dict[str, Any]  # of config.yaml by their dotted names, as read
+    config: Config | None  # None if it is of another version
     rows: list[Row]
     summary: dict[str, Any] | None  # None while the run is not finished
-    clock: dict[str, Any]  # ticks and seconds so far
+    clock: dict[str, Any]  # seconds, and ticks if any, so far
     notes: tuple[str, ...]  # for the reader: partial, stopped seeds, rows left out
     point: bool = False  # whether it is a point of a sweep
 
     @property
     def seeds(self) -> int:
-        """How many seeds every row holds."""
+        """The number of seeds in every row."""
         return int(self.fields["seeds"])
 
     @property
     def task(self) -> str:
-        """The task that is trained on."""
+        """The task of training."""
         return str(self.fields["env.name"])
 
     @property
@@ -70,22 +70,16 @@ class LoadedRun:
         return str(self.fields.get("collect.env") or self.task) if stage == COLLECT else self.task
 
     def flat_stage(self) -> str | None:
-        """Return the stage that is baseline `flat`: its own, or else what `config.collector_is_baseline` says.
-
-        That rule is applied to the fields as read, so that it holds for a config of another version too.
-        """
+        """Return the stage of baseline `flat`: its own, or else collect, as in `config.collector_is_baseline`."""
         if self.of_stage("flat"):
             return "flat"
+        # By the fields, which a config of another version has, too.
         same = self.fields.get("collect.ticks") == self.fields.get("train.ticks") and self.task_of(COLLECT) == self.task
         return COLLECT if same and self.of_stage(COLLECT) else None
 
 
 def read_run(folder: Path, name: str = "") -> LoadedRun:
-    """Read one run's folder.
-
-    Raises:
-      ReportError: it is none, no iteration is finished in it, or its rows are of another run than its config.
-    """
+    """Read one run's folder, or raise ReportError if it is none, or has no finished iteration."""
     files = RunFolder(folder)
     if not files.begun:
         raise ReportError(f"{folder}: expected the folder of a run, with config.yaml in it{_nearest(folder)}")
@@ -99,36 +93,29 @@ def read_run(folder: Path, name: str = "") -> LoadedRun:
         raise ReportError(f"{files.summary_path}: expected the summary of a run, with its methods; got another")
     if summary is None and files.summary_path.exists():
         notes += ("summary.json cannot be read: shown as a run that is not finished",)
-    run = LoadedRun(
-        name or folder.name, folder, fields, config, rows, summary, _json_object(files.clock_path) or {}, notes
-    )
+    clock = _json_object(files.clock_path) or {}
+    run = LoadedRun(name or folder.name, folder, fields, config, rows, summary, clock, notes)
     return dataclasses.replace(run, notes=notes + _state(run) + _stopped(run))
 
 
 def run_of(name: str) -> RunFolder:
-    """Return the folder of the run that a config takes something from: the one it names, or the artifact's there."""
+    """Return the folder of a run, by its path or the path of an artifact in it."""
     files = RunFolder(Path(name))
     return files if files.begun else RunFolder(files.path.parent)
 
 
 def check_seeds(run: LoadedRun) -> None:
-    """Raise ReportError unless every row of a run holds as many seeds as its config says."""
+    """Raise ReportError unless every row of a run has the config's number of seeds."""
     for row in run.rows:
         for name, value in row.items():
             if isinstance(value, list) and len(value) != run.seeds:
                 why = "; a sweep's chunk is shown by its sweep's folder" if run.folder.name.startswith("chunk-") else ""
-                raise ReportError(
-                    f"{RunFolder(run.folder).metrics_path}: {name}: expected {run.seeds} seeds as in config.yaml, "
-                    f"got {len(value)}{why}"
-                )
+                expected = f"expected {run.seeds} seeds as in config.yaml, got {len(value)}{why}"
+                raise ReportError(f"{RunFolder(run.folder).metrics_path}: {name}: {expected}")
 
 
 def unique_names(folders: Sequence[Path]) -> list[str]:
-    """Return for each folder the shortest end of its path that tells it from the others.
-
-    Raises:
-      ReportError: a folder is given twice.
-    """
+    """Return the shortest unique end of each folder's path, or raise ReportError if a folder is there twice."""
     paths = [folder.resolve() for folder in folders]
     for path, count in Counter(paths).items():
         if count > 1:
@@ -143,7 +130,7 @@ def unique_names(folders: Sequence[Path]) -> list[str]:
 
 
 def _nearest(folder: Path) -> str:
-    """Name a run in or beside a folder that is none."""
+    """Return the end of a message that names a run in or beside a folder that is none."""
     pattern = f"*/{RunFolder(folder).config_path.name}"
     for parent, prefix in ((folder, "holds"), (folder.parent, "the nearest is")):
         names = sorted(path.parent.name for path in parent.glob(pattern)) if parent.is_dir() else []
@@ -153,7 +140,7 @@ def _nearest(folder: Path) -> str:
 
 
 def _read_config(files: RunFolder) -> tuple[dict[str, Any], Config | None, tuple[str, ...]]:
-    """Return the fields as they are, and the config where it is of this version."""
+    """Return the fields as they are, the config if it is of this version, and a note if not."""
     path = files.config_path
     try:
         fields = dict(_flatten(yaml.safe_load(path.read_text())))
@@ -177,7 +164,7 @@ def _flatten(tree: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def _read_rows(path: Path) -> tuple[list[Row], tuple[str, ...]]:
-    """Return the rows, and a note where a half-written last one is left out."""
+    """Return the rows, and a note if an incomplete last one is left out."""
     try:
         lines = path.read_text().splitlines(keepends=True) if path.exists() else []
     except UnicodeDecodeError:
@@ -194,7 +181,7 @@ def _read_rows(path: Path) -> tuple[list[Row], tuple[str, ...]]:
 
 
 def _json_object(source: str | Path) -> dict[str, Any] | None:
-    """Return the JSON object in a text or a file, or None where there is none."""
+    """Return the JSON object in a text or a file, or None without one."""
     with contextlib.suppress(OSError, ValueError):
         tree = json.loads(source if isinstance(source, str) else source.read_text())
         return tree if isinstance(tree, dict) else None
@@ -202,7 +189,7 @@ def _json_object(source: str | Path) -> dict[str, Any] | None:
 
 
 def _state(run: LoadedRun) -> tuple[str, ...]:
-    """Note how far a run is that left no summary."""
+    """Return a note on the progress of a run without a summary."""
     if run.summary is not None:
         return ()
     stage = next((row["stage"] for row in reversed(run.rows) if row["stage"] != "evaluate"), "evaluate")
@@ -213,7 +200,7 @@ def _state(run: LoadedRun) -> tuple[str, ...]:
 
 
 def _stopped(run: LoadedRun) -> tuple[str, ...]:
-    """Note which seeds diverged."""
+    """Return notes on the seeds that diverged."""
     notes = [
         f"seed {seed} stopped in stage {stage} after {stop['after']:,}: {stop['quantity']} was not finite"
         for stage, seeds in ((run.summary or {}).get("stopped") or {}).items()
@@ -224,7 +211,7 @@ def _stopped(run: LoadedRun) -> tuple[str, ...]:
 
 
 def per_seed(row: Row, name: str) -> np.ndarray | None:
-    """Return a metric of a row as [K], NaN where it was not finite; None if it is missing or counts."""
+    """Return a metric of a row as [K], NaN for numbers not finite; None for a missing metric, or one of counts."""
     value = row.get(name)
     if value is None or (isinstance(value, list) and any(isinstance(item, list) for item in value)):
         return None

@@ -1,6 +1,6 @@
-// Option spaces: codes on their first two principal components, coloured by what they change.
+// Option spaces: codes on their first two principal components, coloured by the change they cause.
 
-const SPREAD = 0.98; // of |change| is told apart by colour; beyond it, colours stay the same
+const SPREAD = 0.98; // quantile of |change| beyond which colours stay the same
 
 function optionSection() {
   const reasons = Map.groupBy(data.runs.filter((run) => run.options.missing), (run) => run.options.missing);
@@ -14,8 +14,8 @@ function optionFigure(run) {
   const order = options.r2.map((r2, i) => [r2, i]).filter(([r2]) => r2 !== null).sort((a, b) => b[0] - a[0]);
   if (!order.length) return null;
   const coordinate = () => {
-    const asked = Number(settings("coordinate").get(name)?.[0]);
-    return order.some(([, i]) => i === asked) ? asked : order[0][1];
+    const index = Number(settings("coordinate").get(name)?.[0]);
+    return order.some(([, i]) => i === index) ? index : order[0][1];
   };
   const picker = choice("coloured by the change of ", order.map(([r2, i]) => [i, `coordinate ${i} (R² ${number(r2, 2)})`]),
     coordinate, (value) => changeSetting("coordinate", name, [value]));
@@ -31,7 +31,7 @@ function optionFigure(run) {
       `components hold ${options.shares.map((share) => percent(share, 2)).join(" and ")}. ${source} R² is the share of a change that is linear in the two components.`));
 }
 
-// Blue through grey to orange, which eyes of every kind tell apart.
+// Blue through grey to orange, for eyes of every kind.
 function colourOf(t, dark) {
   const middle = dark ? [88, 96, 108] : [205, 209, 216];
   const end = t < 0 ? (dark ? [86, 170, 255] : [0, 90, 181]) : dark ? [255, 158, 64] : [200, 76, 0];

@@ -55,7 +55,7 @@ function durationFigure(run, { label, share, of }) {
     make("p", { class: "fine" }, `All seeds, ${of}.`));
 }
 
-// A picture that moves must have a way to stand still; who asked for less motion gets it still.
+// A moving picture has a pause button, and pauses itself for readers with reduced motion.
 function videoFigure(run) {
   const image = make("img", { src: run.video, width: 320, height: 240, alt: `Video: the first seed's policy over options in ${run.name}, on ${run.facts.task}` });
   const still = make("canvas", { width: 320, height: 240, role: "img", "aria-label": image.alt + ", its first frame" });

@@ -17,24 +17,19 @@ PER_SEED = ("per_seed", "first_per_seed")
 
 
 def read_sweep(folder: Path, name: str) -> tuple[dict[str, Any], list[LoadedRun]]:
-    """Return the table of a sweep as it stands with what is missing, ready for JSON, and its begun points as runs.
-
-    Raises:
-      ReportError: its plan cannot be read, or no point of it has finished an iteration.
-      ConfigError: its config is of another version.
-    """
+    """Return a sweep's table and notes, ready for JSON, and its points as runs, or raise ReportError or ConfigError."""
     try:
         plan = Plan(**json.loads((folder / PLAN).read_text()))
     except (OSError, ValueError, TypeError):
         raise ReportError(f"{folder / PLAN}: expected the plan of a sweep, got another file") from None
     config, runs, missing = RunFolder(folder).config(), [], []
-    for number, which in enumerate(plan.chunks):
+    for number, indices in enumerate(plan.chunks):
         try:
             chunk = read_run(folder / f"chunk-{number:03d}")
         except ReportError:
-            missing += which
+            missing += indices
             continue
-        runs += [_point(chunk, config, plan.points[i], place, f"{name} #{i}") for place, i in enumerate(which)]
+        runs += [_point(chunk, config, plan.points[i], place, f"{name} #{i}") for place, i in enumerate(indices)]
     if not runs:
         raise ReportError(f"{folder}: expected at least one finished iteration of a sweep, got none in its chunks")
     text = (folder / TABLE).read_text() if (folder / TABLE).is_file() else ""
@@ -47,15 +42,13 @@ def read_sweep(folder: Path, name: str) -> tuple[dict[str, Any], list[LoadedRun]
 
 
 def _point(chunk: LoadedRun, config: Config, values: dict[str, Any], place: int, name: str) -> LoadedRun:
-    """Return the part of a chunk that is one point: K of its G K seeds."""
+    """Return one point of a chunk: K of its G K seeds."""
     seeds = slice(place * config.seeds, (place + 1) * config.seeds)
     summary = chunk.summary and {
         **{key: chunk.summary[key] for key in ("versions", "commit", "machine") if key in chunk.summary},
         "methods": _of_seeds(chunk.methods, seeds),
     }
-    rows = [
-        {key: value[seeds] if isinstance(value, list) else value for key, value in row.items()} for row in chunk.rows
-    ]
+    rows = [{name: x[seeds] if isinstance(x, list) else x for name, x in row.items()} for row in chunk.rows]
     (own,) = configs_of(config, [values])
     return dataclasses.replace(
         chunk, name=f"{name}: {show(values)}", rows=rows, summary=summary, clock={}, point=True, config=own,
@@ -64,7 +57,7 @@ def _point(chunk: LoadedRun, config: Config, values: dict[str, Any], place: int,
 
 
 def _of_seeds(tree: dict[str, Any], seeds: slice) -> dict[str, Any]:
-    """Return what is per seed, of these seeds; statistics over all seeds of a chunk mix its points."""
+    """Return the parts per seed, of these seeds; statistics over all seeds of a chunk mix its points."""
     return {
         name: value[seeds] if name in PER_SEED else _of_seeds(value, seeds)
         for name, value in tree.items()

@@ -1,4 +1,4 @@
-// Tables: what was run, what each method reached, sweeps, and configs side by side.
+// Tables: runs, results of methods, sweeps, and configs side by side.
 
 // A row of a table is its cells: text, elements, or td and th of one's own.
 function table(label, heads, rows, kind) {
@@ -8,33 +8,13 @@ function table(label, heads, rows, kind) {
       make("tbody", {}, rows)));
 }
 
-function cell(content, kind) {
-  return make("td", { class: kind }, content);
-}
-
-function numeric(...contents) {
-  return contents.map((content) => cell(content, "n"));
-}
-
-function rowHead(...content) {
-  return make("th", { scope: "row" }, content);
-}
-
-function badge(text, kind = "partial") {
-  return make("span", { class: `badge ${kind}` }, text);
-}
-
-function list(texts, kind) {
-  return make("ul", { class: kind }, texts.map((text) => make("li", {}, text)));
-}
-
-function notes(texts) {
-  return texts.length > 0 && list(texts, "notes");
-}
-
-function differ(values) {
-  return unique(values).length > 1 ? "differs" : null;
-}
+const cell = (content, kind) => make("td", { class: kind }, content);
+const numeric = (...contents) => contents.map((content) => cell(content, "n"));
+const rowHead = (...content) => make("th", { scope: "row" }, content);
+const badge = (text, kind = "partial") => make("span", { class: `badge ${kind}` }, text);
+const list = (texts, kind) => make("ul", { class: kind }, texts.map((text) => make("li", {}, text)));
+const notes = (texts) => texts.length > 0 && list(texts, "notes");
+const differ = (values) => (unique(values).length > 1 ? "differs" : null);
 
 function factsTable() {
   const commits = differ(data.runs.map((run) => run.facts.commit).filter(Boolean));
@@ -96,9 +76,8 @@ function resultRow(run, method, range) {
 }
 
 // The number, and its interval below it.
-function twoLines(summary) {
-  return [number(summary?.iqm), summary && summary.ci95[0] !== null && make("small", {}, bounds(summary.ci95))];
-}
+const twoLines = (summary) =>
+  [number(summary?.iqm), summary && summary.ci95[0] !== null && make("small", {}, bounds(summary.ci95))];
 
 function strip({ return: { per_seed: seeds, iqm, ci95 }, return_untrained: before }, range, colour) {
   const [width, height] = [170, 26];

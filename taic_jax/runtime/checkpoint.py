@@ -1,9 +1,8 @@
 """Trees of arrays on disk: artifacts of a stage and checkpoints of a run, through Orbax.
 
-A tree is stored flat, one array under each leaf's dotted name, so that anyone can read it: Orbax's `load(path)` gives a
-dict. Checkpoints, which are many, hold the bytes of all leaves as one array instead, as Orbax's time is spent per
-array. The metadata beside the arrays hold their checksums, the version of this package, and of checkpoints the layout:
-names, dtypes and shapes.
+A tree is stored flat, one array under each leaf's dotted name, and Orbax's `load(path)` returns it as a dict.
+Checkpoints, which are many, hold the bytes of all leaves as one array, as Orbax spends its time per array. The metadata
+hold the checksums of the arrays, the version of this package, and of checkpoints the layout: names, dtypes and shapes.
 """
 
 import contextlib
@@ -32,72 +31,51 @@ Spec = tuple[tuple[int, ...], np.dtype]
 VERSION, CHECKSUMS, LAYOUT = "taic_jax", "crc32", "layout"  # keys of the metadata
 PACKED = "bytes"  # the one array of a checkpoint
 
-# Orbax's threads also log what it raises, in hundreds of lines.
+# Orbax's threads also log its errors, in hundreds of lines.
 logging.getLogger("absl").addFilter(lambda record: "orbax" not in Path(record.pathname).parts)
 
 
 class ArtifactError(ValueError):
-    """Something on disk is not the tree of arrays that is expected there."""
+    """Files other than the expected tree of arrays, or none."""
 
 
 def save_tree(path: Path, tree: Any) -> None:
-    """Write a tree of arrays to the folder `path`, whole or not at all, in place of what was there.
-
-    Raises:
-        SaveError: it cannot be written; what was there still is.
-    """
+    """Replace the folder `path` by a tree of arrays, atomically; raise SaveError, and leave it, if that fails."""
     path = path.absolute()
-    partial = path.with_name(path.name + PARTIAL)  # Orbax would remove what is there before it writes
+    partial = path.with_name(path.name + PARTIAL)  # Orbax would remove the old folder before it writes
     with _saving(path, partial):
         _begin(partial, _plain(tree), {})()
         if writes_here():
             if path.exists():
                 shutil.rmtree(path)
             partial.rename(path)
-    agree([0])  # no host goes on before it is there
+    agree([0])  # every host waits for the folder
 
 
 def load_arrays(path: Path) -> dict[str, np.ndarray]:
-    """Read what `save_tree` or `Checkpoints` wrote, by dotted name, without arrays that have no entries.
-
-    Raises:
-        ArtifactError: nothing is there, or something else, or it is damaged.
-    """
+    """Read a folder of `save_tree` or `Checkpoints` by dotted name, without empty arrays, or raise ArtifactError."""
     return _read(path)[0]
 
 
 def load_tree(path: Path, like: Tree) -> Tree:
-    """Read a tree of arrays with the structure, shapes and dtypes of `like`, and onto its devices.
-
-    Args:
-        path: the folder that `save_tree` or `Checkpoints` wrote.
-        like: arrays or `jax.ShapeDtypeStruct`s.
-
-    Raises:
-        ArtifactError: nothing is there, or it is not a tree like this one, or it is damaged.
-    """
+    """Read a tree with the names, shapes, dtypes and devices of `like` (arrays or shapes), or raise ArtifactError."""
     arrays, writer = _read(path)
     named = _by_name(like)
     expected = {name: _spec(leaf) for name, leaf in named.items() if leaf.size}
     stored: dict[str, Spec] = {name: (array.shape, array.dtype) for name, array in arrays.items()}
     for name in {**expected, **stored}:
         if expected.get(name) != stored.get(name):
-            want, got = _show(expected.get(name)), _show(stored.get(name))
+            difference = f"expected {_show(expected.get(name))} at {name or 'the root'}, got {_show(stored.get(name))}"
             by = "" if writer == _version() else f"; taic_jax {writer} wrote it, this is {_version()}"
-            raise ArtifactError(f"{path}: expected {want} at {name or 'the root'}, got {got}{by}")
-    leaves = [_restored(arrays.get(name), leaf) for name, leaf in named.items()]
+            raise ArtifactError(f"{path}: {difference}{by}")
+    leaves = [_restore(arrays.get(name), leaf) for name, leaf in named.items()]
     return jax.tree.unflatten(jax.tree.structure(like), leaves)
 
 
 class Checkpoints:
-    """The last few checkpoints of a run, each a folder named by its step, written while the run goes on.
+    """The latest `keep` checkpoints of a run, each a folder named by its step, written while the run goes on.
 
-    Args:
-        directory: the folder that holds them.
-        keep: how many of the latest to keep; older ones, which a killed run may have left, are removed.
-
-    Raises:
-        SaveError: they cannot be removed.
+    Older ones, which a killed run may have left, are removed at once, or SaveError is raised.
     """
 
     def __init__(self, directory: Path, keep: int = 2):
@@ -114,12 +92,10 @@ class Checkpoints:
         return max(self.steps(), default=None)
 
     def save(self, step: int, tree: Any) -> None:
-        """Begin to save a tree of arrays as this step, whole or not at all, once the step before is saved.
+        """Begin to save a tree of arrays as this step, atomically, once the step before is saved.
 
-        The arrays are read here, so they may be donated afterwards.
-
-        Raises:
-            SaveError: this step or the one before cannot be written; those that were saved are still there.
+        The arrays are read at once and may be donated afterwards. Raise SaveError if this step or the one before
+        cannot be written; earlier steps stay.
         """
         self.wait()
         path, arrays = self.directory / str(step), _plain(tree)
@@ -130,11 +106,7 @@ class Checkpoints:
             self._pending = path, _begin(path, {PACKED: packed}, {LAYOUT: layout})
 
     def wait(self) -> None:
-        """Wait until the step is saved that is being saved, if one is, and drop the oldest steps.
-
-        Raises:
-            SaveError: it cannot be written; those before it are still there.
-        """
+        """Wait for the end of a save, if one goes on, and drop the oldest steps, or raise SaveError and leave them."""
         if self._pending is None:
             return
         (path, finish), self._pending = self._pending, None
@@ -144,11 +116,7 @@ class Checkpoints:
 
     @contextlib.contextmanager
     def waited_for(self) -> Iterator[None]:
-        """End the context, however it ends, with nothing being saved any more.
-
-        Raises:
-            SaveError: the last step cannot be written; a `SaveError` that ends the context goes before it.
-        """
+        """Wait for the last save at the end of the context; its SaveError gives way to one of the context."""
         try:
             yield
         except SaveError:
@@ -165,11 +133,7 @@ class Checkpoints:
                     shutil.rmtree(self.directory / str(old))
 
     def load(self, step: int, like: Tree) -> Tree:
-        """Load the tree of this step.
-
-        Raises:
-            ArtifactError: see `load_tree`; the message says what is left without this step.
-        """
+        """Load the tree of this step, or raise ArtifactError with the step that --resume would go on from."""
         path = self.directory / str(step)
         try:
             return load_tree(path, like)
@@ -180,7 +144,7 @@ class Checkpoints:
 
 
 def _begin(path: Path, arrays: dict[str, np.ndarray], extra: dict[str, Any]) -> Callable[[], None]:
-    """Begin to write arrays to the folder `path`, with `extra` metadata; return a function that waits for the end."""
+    """Begin to write arrays and `extra` metadata to the folder `path`; return a function that waits for the end."""
     path.parent.mkdir(parents=True, exist_ok=True)
     if writes_here():
         make_room(path.parent, sum(array.nbytes for array in arrays.values()) + len(arrays) * 2**10 + 2**14)
@@ -190,7 +154,7 @@ def _begin(path: Path, arrays: dict[str, np.ndarray], extra: dict[str, Any]) -> 
 
 @contextlib.contextmanager
 def _saving(path: Path, written: Path) -> Iterator[None]:
-    """Say in one line why `path` cannot be saved, and remove what there is by then of the folder that is written."""
+    """Say in one line why `path` cannot be saved, and remove Orbax's incomplete copy of the folder `written`."""
     try:
         with writing(path):
             yield
@@ -214,13 +178,13 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], str]:
         sums = _checksums(arrays)
         if beside.get(CHECKSUMS, sums) != sums:  # earlier versions wrote none
             raise ValueError
-        arrays = _unpacked(arrays[PACKED], beside[LAYOUT]) if LAYOUT in beside else arrays
+        arrays = _unpack(arrays[PACKED], beside[LAYOUT]) if LAYOUT in beside else arrays
     except (ValueError, OSError, AttributeError, KeyError, TypeError):
         raise ArtifactError(f"{path}: expected an artifact, got files of another kind or damaged ones") from None
     return arrays, beside.get(VERSION, _version())
 
 
-def _unpacked(packed: np.ndarray, layout: list) -> dict[str, np.ndarray]:
+def _unpack(packed: np.ndarray, layout: list) -> dict[str, np.ndarray]:
     arrays, begin = {}, 0
     for name, dtype, shape in layout:
         end = begin + math.prod(shape) * np.dtype(dtype).itemsize
@@ -235,20 +199,20 @@ def _by_name(tree: Any) -> dict[str, Any]:
 
 
 def _plain(tree: Any) -> dict[str, np.ndarray]:
-    """Return the leaves by dotted name as NumPy's arrays, without those that have no entries: Orbax has none."""
+    """Return the leaves by dotted name as NumPy's arrays, without empty ones, which Orbax refuses."""
     named = {name: leaf for name, leaf in _by_name(tree).items() if leaf.size}
     return jax.device_get({name: jax.random.key_data(x) if _is_key(x) else x for name, x in named.items()})
 
 
 def _spec(leaf: Any) -> Spec:
-    """Return the shape and dtype of a leaf as `_plain` gives it."""
+    """Return the shape and dtype of a leaf of `_plain`."""
     plain = jax.eval_shape(jax.random.key_data, leaf) if _is_key(leaf) else leaf
     return plain.shape, plain.dtype
 
 
-def _restored(array: np.ndarray | None, leaf: Any) -> jax.Array:
-    """Undo `_plain` for one leaf, from one like it; onto its devices."""
-    if array is None:  # it has no entries
+def _restore(array: np.ndarray | None, leaf: Any) -> jax.Array:
+    """Undo `_plain` for one leaf, in the form and on the devices of another."""
+    if array is None:  # an empty leaf
         return jnp.zeros(leaf.shape, leaf.dtype)
     if _is_key(leaf):
         kind = jax.random.key_impl(jnp.zeros((), leaf.dtype))  # an abstract leaf has no implementation to ask

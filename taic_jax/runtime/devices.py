@@ -1,5 +1,6 @@
-"""Many devices: the rows of a program (the seeds of all points), or its environments, over all that JAX sees."""
+"""Many devices: splits of a program's rows (the seeds of all points), or of its environments, over JAX's devices."""
 
+import contextlib
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -23,17 +24,17 @@ SEEDS, ENVS = "seeds", "envs"
 
 @dataclass(frozen=True)
 class Devices:
-    """What `--shard` asks for; `none` leaves every array and program on one device.
+    """The devices of `--shard`; `none` leaves every array and program on one device.
 
-    Over `seeds`, each device runs the program on its part of the rows, and nothing is exchanged. Over `envs`, each
-    device has all arrays and does all updates, but rolls out its part of the environments; one exchange a rollout.
+    Over `seeds`, each device runs the program on its part of the rows, without exchange. Over `envs`, each device has
+    all arrays and does all updates, but rolls out its part of the environments, with one exchange a rollout.
     """
 
     shard: Shard = "none"
 
     @cached_property
     def mesh(self) -> Mesh:
-        """The devices, along one axis with the name of what is split."""
+        """The devices, along one axis, named `seeds` or `envs`."""
         return jax.make_mesh((jax.device_count(),), (self.shard,), axis_types=(AxisType.Auto,))
 
     @property
@@ -41,7 +42,7 @@ class Devices:
         return Spec(SEEDS) if self.shard == SEEDS else Spec()
 
     def place(self, rows: Tree) -> Tree:
-        """Return rows where programs take them; the last one is repeated until all devices have as many."""
+        """Move rows onto the devices, and repeat the last one until all devices have equally many."""
         if self.shard == "none":
             return rows
         if self.shard == SEEDS:
@@ -49,10 +50,10 @@ class Devices:
         return self._send(rows, self._spec)
 
     def take(self, rows: Tree, count: int) -> Tree:
-        """Return the first `count` rows, all but those that `place` added, on one device of every host.
+        """Return the first `count` rows, without those that `place` added, on one device of every host.
 
-        What is computed with them later, be it a slice, would otherwise run on all devices and exchange what it needs;
-        on a CPU many such small programs at once can take all threads, and then wait for each other for ever.
+        Otherwise every later computation, even a slice, would run on all devices and exchange its inputs; on a CPU
+        many such small programs at once can take all threads, and then wait for each other for ever.
         """
         if jax.process_count() > 1:
             rows = jax.tree.map(on_this_host, self._send(rows, Spec()))
@@ -61,20 +62,19 @@ class Devices:
         return jax.tree.map(lambda x: x if len(x) == count else x[:count], rows)
 
     def compile(self, function: Callable, *args: Any, donate: bool = False) -> Callable:
-        """Compile a function of rows and to rows for arguments that were placed; the first may be donated."""
+        """Compile a function from rows to rows for placed arguments; the first may be donated."""
         settings: dict[str, Any] = {"donate_argnums": 0 if donate else ()}
-        if self.shard == "none":
-            return jax.jit(function, **settings).lower(*args).compile(compiler_options=compiler_options())
+        split, spec = self.shard != "none", self._spec
         if self.shard == SEEDS:
-            spec = self._spec
             function = jax.shard_map(function, mesh=self.mesh, in_specs=spec, out_specs=spec, check_vma=False)
-        with jax.set_mesh(self.mesh):
-            settings["out_shardings"] = NamedSharding(self.mesh, self._spec)
+        if split:
+            settings["out_shardings"] = NamedSharding(self.mesh, spec)
+        with jax.set_mesh(self.mesh) if split else contextlib.nullcontext():
             return jax.jit(function, **settings).lower(*args).compile(compiler_options=compiler_options())
 
     def _send(self, rows: Tree, spec: Spec) -> Tree:
         sharding = NamedSharding(self.mesh, spec)
-        if jax.process_count() > 1:  # where `device_put` takes only devices of this host
+        if jax.process_count() > 1:  # then `device_put` takes only devices of this host
             return jax.jit(_same, out_shardings=sharding)(rows)
         return jax.device_put(rows, sharding)
 
@@ -84,18 +84,15 @@ class Devices:
 
 
 def _same(rows: Tree) -> Tree:
-    """Return rows as they are; one function for all calls, or each of them would be compiled."""
+    """Return rows unchanged; a lambda in each call would be compiled each time."""
     return rows
 
 
 def open_devices(shard: Shard, rows: int, hosts: Hosts = ALONE) -> Shard:
-    """Have JAX take each physical core of a CPU for a device, or fewer where rows want no more; return what to split.
+    """Make each physical core of a CPU a device, or fewer if the rows need fewer; return the resolved `shard`.
 
-    To be called before anything is computed. A number of devices that JAX's own settings name stays. Over several
-    hosts, wait for the others.
-
-    Raises:
-      ConfigError: the other hosts cannot be reached.
+    Call it before any computation. JAX's own setting of the number of devices prevails. Connect to the other hosts, or
+    raise ConfigError.
     """
     is_set = "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
     if shard != "none" and not is_set and jax.config.values["jax_num_cpu_devices"] < 1:
@@ -110,35 +107,25 @@ def open_devices(shard: Shard, rows: int, hosts: Hosts = ALONE) -> Shard:
 
 
 def fewest(rows: int, cores: int) -> int:
-    """Return the fewest devices, each a core, that have as few rows each as with all cores.
-
-    Of ten rows on eight cores some core has two: then five do, and nobody repeats a row.
-    """
+    """Return the fewest devices, each a core, that have as few rows each as with all cores: of ten rows on eight, 5."""
     return -(-rows // -(-rows // cores))
 
 
 def make_devices(shard: Shard, config: Config) -> Devices:
-    """Return the devices that the rows or the environments of a run are split over.
-
-    Raises:
-      ConfigError: environments do not divide by the devices.
-    """
+    """Return the devices of a run, or raise ConfigError if its environments do not divide by them."""
     count = jax.device_count()
     for name, ppo in (("collect", config.collect.ppo), ("train", config.train.ppo)):
         if shard == ENVS and ppo.num_envs % count:
-            nearest = max(round(ppo.num_envs / count), 1) * count
-            raise ConfigError(
-                f"--shard envs: expected {name}.ppo.num_envs to be a multiple of the {count} devices, "
-                f"got {ppo.num_envs}; the nearest valid value is {nearest}"
-            )
+            valid = f"the nearest valid value is {max(round(ppo.num_envs / count), 1) * count}"
+            expected = f"expected {name}.ppo.num_envs to be a multiple of the {count} devices"
+            raise ConfigError(f"--shard envs: {expected}, got {ppo.num_envs}; {valid}")
     return Devices(shard)
 
 
 def over_envs(scan: Callable[[Any, Any], tuple[Any, Any]], num_envs: int) -> Callable[[Any, Any], tuple[Any, Any]]:
-    """Split a scan over ticks, (environments [B], [T, B]) -> ([B], [T, B]), where environments are split.
+    """Split a scan over ticks, (environments [B], [T, B]) -> ([B], [T, B]), over the devices of `--shard envs`.
 
-    The results are on all devices. What does not divide by them, as the episodes of an evaluation, each device does
-    whole.
+    The results are on all devices. If the environments do not divide by the devices, each device scans all.
     """
     count = jax.sharding.get_abstract_mesh().shape.get(ENVS)
     if count is None:

@@ -1,4 +1,4 @@
-"""What every stage of the main job is driven by: compile once, step, log, checkpoint, resume."""
+"""The driver of every stage of the main job: compile once, step, log, checkpoint, resume."""
 
 import contextlib
 import json
@@ -32,44 +32,39 @@ S = TypeVar("S")
 STAGE_STREAMS = {
     "collect": 0, "learn": 1, "train": 2, "flat": 3, "evaluate": 4, "video": 5, "repeat": 6, "total": 7, "transfer": 8,
 }  # fmt: skip
-"""The stream of random numbers that each stage draws from. A number is never reused: old runs drew from it."""
+"""The stream of random numbers of each stage. A number is never reused: old runs draw from it."""
+# The stages whose results a stage starts from: a seed that stopped there stays stopped.
 BUILDS_ON = {"learn": ("collect",), "train": ("collect", "learn")}
-"""What a stage starts from: a seed that stopped there stays stopped."""
 CHECKPOINT_SECONDS = 30.0
 DUMPS = "dumps"
 
 
 @dataclass
 class Clock:
-    """Seconds spent compiling and running, and the ticks run in that time, which a resume reads off checkpoints."""
+    """Seconds of compilation and of running, and the ticks in that time, which a resume counts from checkpoints."""
 
     compile: float = 0.0
     run: float = 0.0
     ticks: int = 0
 
     def add(self, since: float, path: Path) -> float:
-        """Count what ran since then, write the seconds so that a resumed run counts on, and return the time."""
+        """Add the time since then, write the seconds for a resumed run, and return the time."""
         self.run += time.perf_counter() - since
         save_json(path, {"compile": self.compile, "run": self.run})
         return time.perf_counter()
 
     @classmethod
     def load(cls, path: Path) -> "Clock":
-        """Read what `add` wrote; without a file, start at zero.
-
-        Raises:
-          ArtifactError: it is not such a file.
-        """
+        """Read the file of `add`, or raise ArtifactError; without a file, start at zero."""
         try:
             return cls(**json.loads(path.read_text())) if path.exists() else cls()
         except (ValueError, TypeError):
-            raise ArtifactError(
-                f"{path}: expected the seconds of a run, got another file; without it they start at 0"
-            ) from None
+            expected = "expected the seconds of a run, got another file; without it they start at 0"
+            raise ArtifactError(f"{path}: {expected}") from None
 
 
 class Stopped(NamedTuple):
-    """Of one stage, for every seed: `FINITE`, or why it stopped, and what it had done by then, in the logs' unit."""
+    """One stage's codes [K], `FINITE` or the reason of a stop, and the ticks or steps [K] before the stop."""
 
     code: np.ndarray
     after: np.ndarray
@@ -77,7 +72,7 @@ class Stopped(NamedTuple):
 
 @dataclass(frozen=True)
 class Run:
-    """What every stage needs: rows of configs and keys, one per seed (of each point), where to write, when to stop."""
+    """The state that stages share: rows of configs and keys, one per seed (of each point), the folder and signals."""
 
     config: Config
     keys: jax.Array
@@ -103,13 +98,10 @@ class Run:
         quiet: bool = False,
         **settings: Any,
     ) -> Iterator["Run"]:
-        """Begin a run in the folder `path`, or resume the one in it; nobody else writes there while in the context.
+        """Begin or resume a run in the folder `path`, and lock it in the context.
 
         Args as `pipeline.run_pipeline`; `settings` are the `devices`, `signals`, `checkpoint_seconds` and `population`.
-
-        Raises:
-          RunFolderError: the folder holds another run, or none to resume, or another process is at it.
-          ArtifactError: its clock is damaged.
+        Raise RunFolderError for a folder of another run, none to resume or a busy one, ArtifactError for a bad clock.
         """
         folder, points = RunFolder(path), points or (config,)
         folder.prepare(config, resume=resume, overwrite=overwrite)
@@ -123,7 +115,7 @@ class Run:
     @classmethod
     @contextlib.contextmanager
     def view(cls, config: Config, path: Path, point: Config) -> Iterator["Run"]:
-        """Give one point of the run in the folder `path`, a config of arrays, and neither claim nor write anything."""
+        """Yield one point of the run in the folder `path`, a config of arrays; neither lock nor write the folder."""
         with tempfile.TemporaryDirectory() as logs, RunLogger(Path(logs), quiet=True) as logger:
             yield cls(as_rows([point], config.seeds), _keys(config), RunFolder(path), logger)
 
@@ -137,47 +129,42 @@ class Run:
         return jax.vmap(partial(jax.random.fold_in, data=STAGE_STREAMS[stage]))(self.keys)
 
     def rows(self, tree: S) -> S:
-        """Return the rows of the run's own seeds and points, of those that the devices had."""
+        """Return the rows of the run's own seeds and points, without those that the devices repeat."""
         return self.devices.take(tree, len(self.keys))
 
     def inherited(self, stage: str) -> jax.Array:
-        """Return the codes [K] of the seeds that stopped in what this stage builds on."""
+        """Return the codes [K] of the seeds in the stages that this one builds on."""
         codes = [jnp.full(len(self.keys), FINITE, jnp.int32)]
         codes += [jnp.asarray(self.stopped[name].code) for name in BUILDS_ON.get(stage, ()) if name in self.stopped]
         return jnp.stack(codes).max(axis=0)
 
     def record_divergence(self, stage: str, guard: Guarded, unit: int, before: np.ndarray | None = None) -> np.ndarray:
-        """Note which seeds have stopped, dump and report those whose codes were others `before`, and return all [K].
+        """Record and return the seeds' codes [K], and dump and report each seed whose code was another `before`.
 
-        Raises:
-          DivergedError: none goes on.
+        Raise DivergedError if no seed goes on.
         """
         codes, steps = jax.device_get((guard.code, guard.step))
         self.stopped[stage] = Stopped(codes, steps * unit)
         for seed in np.flatnonzero(codes != before) if before is not None else ():
             self._dump(stage, guard, unit, int(seed))
         if (codes != FINITE).all():
-            where = self.dir / DUMPS
-            raise DivergedError(f"{stage}: every seed has stopped, at numbers that are not finite: see {where}")
+            dumps = self.dir / DUMPS
+            raise DivergedError(f"{stage}: every seed has stopped, at numbers that are not finite: see {dumps}")
         return codes
 
     def _dump(self, stage: str, guard: Guarded, unit: int, seed: int) -> None:
-        """Save the last good state of a seed for `--replay`, and say that it has stopped."""
+        """Save the last good state of a seed for `--replay`, and report the stop."""
         code, step = (int(x[seed]) for x in jax.device_get((guard.code, guard.step)))
         quantity = QUANTITIES[code]
-        description = {"stage": stage, "seed": seed, "seeds": len(self.keys), "step": step}
-        description |= {"after": step * unit, "quantity": quantity}
+        description = {"stage": stage, "seed": seed, "seeds": len(self.keys), "step": step, "after": step * unit}
         folder = self.dir / DUMPS / f"{stage}-{step * unit}-seed{seed}"
         evolved = isinstance(guard.state, Members)
         state, config = (guard.state.state, guard.state.config) if evolved else (guard.state, self.config)
         for name, rows in {"state": state, "config": config}.items():
             save_tree(folder / name, jax.tree.map(lambda x: x[seed], rows))
-        save_description(folder, description)
-        print(
-            f"taic_jax: seed {seed} stopped in {stage} after {step * unit:,}: its {quantity} is not finite; "
-            f"--replay {folder} shows it again",
-            file=sys.stderr,
-        )
+        save_description(folder, description | {"quantity": quantity})
+        why = f"its {quantity} is not finite; --replay {folder} shows it again"
+        print(f"taic_jax: seed {seed} stopped in {stage} after {step * unit:,}: {why}", file=sys.stderr)
 
     def compile(self, stage: str, function: Callable, *args: Any, donate: bool = False) -> Callable:
         """Compile ahead of time for placed rows; a call of other shapes or types fails instead of compiling again."""
@@ -194,10 +181,8 @@ def _keys(config: Config, points: int = 1) -> jax.Array:
 
 
 def resume(checkpoints: Checkpoints, guard: Guarded) -> tuple[Guarded, int]:
-    """Return the last checkpoint that every host sees, and its step; without one, `guard` and 0.
-
-    Types are never weak, as a checkpoint's are not: the program compiled at the start is the one that resumes.
-    """
+    """Return the last checkpoint that every host sees, and its step; without one, `guard` and 0."""
+    # A checkpoint's types are never weak: so a start and a resume compile the same program.
     guard = jax.tree.map(
         lambda x: jax.lax.convert_element_type(x, x.dtype) if getattr(x, "weak_type", False) else x, guard
     )
@@ -216,25 +201,23 @@ def drive(
     ticks: int = 0,
     after: Callable[[int, Any], None] | None = None,
 ) -> S:
-    """Take `num_steps` steps, from the stage's last checkpoint on, logging each.
+    """Take and log `num_steps` steps in all, from the stage's last checkpoint on, and return the state.
 
     A seed whose numbers are not finite stops at its last good state, which is also dumped; the others go on.
 
     Args:
-      run: the run; its `stopped` notes the seeds that did not get through.
-      stage: its name.
-      step: (states [K], *args) -> (states, metrics [K] with the codes `nonfinite`, what `after` takes).
+      run: the run; its `stopped` receives the codes.
+      step: (states [K], *args) -> (states, metrics [K] with the codes `nonfinite`, input of `after`).
       state: before the first step; consumed.
-      *args: arrays that stay the same.
-      num_steps: in all.
-      unit: what a step counts for in logs: ticks per seed, or gradient steps.
-      ticks: interactions a step costs over all seeds.
+      *args: constant arrays.
+      unit: ticks per seed, or gradient steps, of a step in the logs.
+      ticks: interactions of a step over all seeds.
       after: called with the step's index and the third result.
 
     Raises:
-      Interrupted: a signal was received; the step that was being taken is finished and saved.
+      Interrupted: at a signal, after the current step is finished and saved.
       DivergedError: every seed has stopped.
-      SaveError: something cannot be written; the checkpoints before are still there.
+      SaveError: a file cannot be written; earlier checkpoints stay.
     """
     checkpoints = Checkpoints(run.dir / "checkpoints" / stage)
     guard, first = resume(checkpoints, begin(state, run.inherited(stage)))
@@ -263,5 +246,5 @@ def drive(
                 saved = run.clock.add(saved, run.folder.clock_path)
             if received:
                 raise Interrupted(received)
-    agree([0])  # no host reads what `after` writes before it is there
+    agree([0])  # every host waits for the files of `after`
     return run.rows(guard.state)

@@ -1,4 +1,4 @@
-"""Files that appear under their name when they are whole, and not before, and one line of error where that fails."""
+"""Atomic writes: a file has its name only once it is complete, and a failure is one line of error."""
 
 import contextlib
 import csv
@@ -11,24 +11,18 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
-PARTIAL = ".partial"
-"""Ending of a file that is not whole yet."""
-DESCRIPTION = "description.json"
-"""File beside arrays that says what they are."""
-TEMPORARY = ".orbax-checkpoint-tmp"  # Orbax writes a folder under this suffix, and renames when all is written
+PARTIAL = ".partial"  # ending of an incomplete file
+DESCRIPTION = "description.json"  # describes the arrays beside it
+TEMPORARY = ".orbax-checkpoint-tmp"  # Orbax writes a folder under this suffix, and renames it at the end
 
 
 class SaveError(OSError):
-    """A file could not be written: the disk is full, or may not be written to."""
+    """A failure to write a file: the disk is full, or may not be written to."""
 
 
 @contextlib.contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Say in one line what keeps `path` from being written.
-
-    Raises:
-        SaveError: something does.
-    """
+    """Turn an OSError in the context into a SaveError, one line that says why `path` cannot be written."""
     try:
         yield
     except SaveError:
@@ -38,23 +32,17 @@ def writing(path: Path) -> Iterator[None]:
 
 
 def writes_here() -> bool:
-    """Return whether this host writes what a run keeps: of several hosts of one run, the first does."""
+    """Return whether this host writes the files of a run: of several hosts, the first does."""
     import jax  # the command lines answer without it
 
     return not jax.distributed.is_initialized() or jax.process_index() == 0
 
 
 @contextlib.contextmanager
-def whole_file(path: Path) -> Iterator[BinaryIO]:
-    """Give a file to write, that takes the place of `path` once it is whole, and is removed if it does not get there.
-
-    On a host that does not write, it goes nowhere.
-
-    Raises:
-        SaveError: it cannot be written.
-    """
+def atomic_file(path: Path) -> Iterator[BinaryIO]:
+    """Yield a file that replaces `path` at the end of the context, or is removed and raises SaveError if that fails."""
     if not writes_here():
-        yield io.BytesIO()
+        yield io.BytesIO()  # goes nowhere
         return
     partial = path.with_name(path.name + PARTIAL)
     with writing(path):
@@ -69,36 +57,23 @@ def whole_file(path: Path) -> Iterator[BinaryIO]:
 
 
 def save_text(path: Path, text: str) -> None:
-    """Write a text file, whole or not at all, in place of what was there.
-
-    Raises:
-        SaveError: it cannot be written.
-    """
-    with whole_file(path) as file:
+    """Write a text file atomically, or raise SaveError."""
+    with atomic_file(path) as file:
         file.write(text.encode())
 
 
 def save_json(path: Path, tree: Any) -> None:
-    """Write a tree as indented JSON, whole or not at all.
-
-    Raises:
-        SaveError: it cannot be written.
-        ValueError: a number is not finite (see `json_safe`).
-    """
+    """Write a tree as indented JSON, atomically; raise SaveError, or ValueError for a number that is not finite."""
     save_text(path, json.dumps(tree, indent=2, allow_nan=False) + "\n")
 
 
 def save_description(folder: Path, description: Mapping[str, Any]) -> None:
-    """Write what the arrays in a folder are.
-
-    Raises:
-        SaveError: it cannot be written.
-    """
+    """Write the description of the arrays in a folder, or raise SaveError."""
     save_json(folder / DESCRIPTION, description)
 
 
 def read_description(folder: Path) -> dict[str, Any] | None:
-    """Read what `save_description` wrote: None without a JSON file there, and {} where it holds something else."""
+    """Read a folder's description: None without a JSON file, and {} if the file holds anything but an object."""
     try:
         description = json.loads((folder / DESCRIPTION).read_text())
     except (OSError, ValueError):
@@ -107,11 +82,7 @@ def read_description(folder: Path) -> dict[str, Any] | None:
 
 
 def save_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write rows with the same columns as CSV, whole or not at all.
-
-    Raises:
-        SaveError: it cannot be written.
-    """
+    """Write rows with the same columns as CSV, atomically, or raise SaveError."""
     text = io.StringIO(newline="")
     writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
     writer.writeheader()
@@ -120,12 +91,7 @@ def save_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 def json_safe(tree: Any, digits: int | None = None) -> Any:
-    """Return a tree of mappings, sequences, arrays and numbers as JSON has them.
-
-    Args:
-        tree: of any depth; what is not finite becomes None.
-        digits: significant digits that floats are rounded to; None keeps them all.
-    """
+    """Return a tree of arrays and numbers in JSON's types, rounded to `digits`, if any, with None for NaN and inf."""
     if isinstance(tree, Mapping):
         return {name: json_safe(item, digits) for name, item in tree.items()}
     if hasattr(tree, "tolist"):  # an array, or one of its numbers
@@ -138,11 +104,7 @@ def json_safe(tree: Any, digits: int | None = None) -> Any:
 
 
 def make_room(folder: Path, size: int) -> None:
-    """Check that so many bytes can be written in a folder.
-
-    Raises:
-        OSError: they cannot.
-    """
+    """Check that `size` bytes can be written in a folder, or raise OSError."""
     partial = folder / f"room{PARTIAL}"
     try:
         partial.write_bytes(bytes(size))
@@ -151,11 +113,7 @@ def make_room(folder: Path, size: int) -> None:
 
 
 def remove_partial(folder: Path) -> None:
-    """Remove what processes that were killed while they wrote have left anywhere in a folder.
-
-    Raises:
-        SaveError: something cannot be removed.
-    """
+    """Remove the incomplete files of killed processes anywhere in a folder, or raise SaveError."""
     with writing(folder):
         for path in [*folder.rglob(f"*{PARTIAL}"), *folder.rglob(f"*{TEMPORARY}")]:
             shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)

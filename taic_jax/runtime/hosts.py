@@ -1,7 +1,7 @@
 """One run over several hosts, each of which runs this program.
 
-All go through the same iterations and hold the same results, which the first writes to a folder that all see. News of
-one host, such as a signal to stop, goes to all by `agree`.
+All compute the same iterations and results, and the first writes the results to a folder that all see. `agree` sends
+the news of one host, such as a signal to stop, to all.
 """
 
 import signal
@@ -18,14 +18,12 @@ from jax.experimental import multihost_utils
 
 from taic_jax.config import ConfigError
 
-PATIENCE = 20.0
-"""Seconds in which the first host must answer the others."""
-FOREVER = 10**6
-"""Seconds that JAX waits for the last host; at their end it would print a stack of C++ instead of an error."""
+PATIENCE = 20.0  # seconds for the first host to answer the others
+FOREVER = 10**6  # seconds that JAX waits for the last host; afterwards it prints a stack of C++ instead of an error
 
 
 class Hosts(NamedTuple):
-    """Of a run over several hosts: where the first one can be reached, how many they are, and which this is."""
+    """The hosts of a run: the first one's HOST:PORT, their number, and the index of this one."""
 
     coordinator: str = ""
     count: int = 1
@@ -36,11 +34,7 @@ ALONE = Hosts()
 
 
 def join(hosts: Hosts) -> None:
-    """Meet the other hosts at the first one, however long the last one takes to come.
-
-    Raises:
-      ConfigError: the first does not answer, or refuses this one.
-    """
+    """Connect to the other hosts, however late the last; raise ConfigError if the first is silent or refuses this."""
     if hosts.index:
         _await_answer(hosts.coordinator)
     else:
@@ -78,7 +72,7 @@ def agree(numbers: Sequence[int], least: bool = False) -> list[int]:
 
 
 def on_this_host(x: jax.Array) -> Any:
-    """Return an array that every device has, as one that is free to go to any."""
+    """Return a copy of a replicated array that is committed to no device."""
     x = x.addressable_data(0)
     if jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
         return jax.random.wrap_key_data(jnp.asarray(np.asarray(jax.random.key_data(x))), impl=jax.random.key_impl(x))

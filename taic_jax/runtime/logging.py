@@ -1,7 +1,7 @@
 """Metrics of a run: one row per log point in metrics.jsonl, TensorBoard events, and progress on standard error.
 
-metrics.jsonl is the record; the events are drawn from it. So when a run resumes, rows after the checkpoint
-are dropped from the one, and the other is drawn again.
+The events are derived from metrics.jsonl: when a run resumes, the rows after the checkpoint are dropped, and the events
+written anew.
 """
 
 import contextlib
@@ -25,15 +25,12 @@ Unit = Literal["ticks", "steps"]
 
 
 class RunLogger:
-    """Write what a run measures; a context manager.
+    """A context manager that writes the metrics of a run and, unless `quiet`, shows its progress.
 
-    A row of metrics.jsonl holds `stage`, `ticks`, `time` (seconds since the epoch), and each metric as
-    `stage/name`: a number, or a list with one number per seed, or per seed a list of counts. What is not finite
-    is null. Events hold the mean over seeds, and of counts a histogram of them all.
-
-    Args:
-        run_dir: folder of the run; rows that it already holds are kept, but for a half-written last one.
-        quiet: show no progress.
+    A row of metrics.jsonl holds `stage`, `ticks`, `time` (seconds since the epoch), and each metric as `stage/name`: a
+    number, or a list with one number per seed, or per seed a list of counts. Numbers that are not finite are null.
+    Events hold the mean over seeds, and of counts one histogram. Rows of an earlier process stay, but for an incomplete
+    last one.
     """
 
     def __init__(self, run_dir: Path, *, quiet: bool = False):
@@ -42,7 +39,9 @@ class RunLogger:
         with writing(run_dir):
             self._events_dir.mkdir(parents=True, exist_ok=True)
         with writing(self._path):
-            _drop_half_row(self._path)
+            if self._path.exists():  # cut the bytes that a killed run left after the last newline
+                with self._path.open("rb+") as file:
+                    file.truncate(file.read().rfind(b"\n") + 1)
         self._open()
         self._display, self._stage = Display(quiet), None
 
@@ -56,31 +55,28 @@ class RunLogger:
 
     @contextlib.contextmanager
     def stage(self, name: str, total: int, done: int = 0) -> Iterator[None]:
-        """Show the progress of a stage of `total` ticks or steps, of which `done` were made before a resume."""
+        """Show the progress of a stage of `total` ticks or steps, `done` of them before a resume."""
         self._stage = Work(name, total, done, done)
         with self._display.showing(self._stage):
             yield
         self._stage = None
 
     def say(self, text: str) -> None:
-        """Say something once, among the progress."""
+        """Print a line among the progress."""
         self._display.say(text)
 
     def doing(self, text: str) -> contextlib.AbstractContextManager[None]:
-        """Show in the context that a run is at something that has no measure, as in `train: compiling`."""
+        """Show work without a measure in the context, as in `train: compiling`."""
         return self._display.showing(Work(text))
 
     def log(self, stage: str, count: int, metrics: Mapping[str, Any], unit: Unit = "ticks") -> None:
-        """Write one row.
+        """Write one row, or raise SaveError.
 
         Args:
-            stage: name of the stage; each metric is written as `stage/name`.
+            stage: prefix of each metric's name, as in `stage/name`.
             count: interactions, or gradient steps, so far in this stage, per seed.
-            metrics: numbers, or arrays of shape [K] with one number per seed, or [K, L] with how often 1..L occurred.
-            unit: what `count` counts, and its name in the row.
-
-        Raises:
-            SaveError: the row cannot be written.
+            metrics: numbers, or arrays of shape [K] with one number per seed, or [K, L] with the counts of 1..L.
+            unit: name of `count` in the row.
         """
         row: Row = {"stage": stage, unit: count, "time": round(time.time(), 3)}
         row |= json_safe({f"{stage}/{name}": value for name, value in metrics.items()})
@@ -96,7 +92,7 @@ class RunLogger:
             self._display.update(work)
 
     def truncate(self, stage: str, count: int) -> None:
-        """Drop the rows of a stage after `count`, which a resumed run will write again; -1 drops them all."""
+        """Drop the rows of a stage after `count`, which a resumed run writes again; -1 drops them all."""
         rows = self._folder.metrics()
         remaining = [row for row in rows if row["stage"] != stage or _count(row) <= count]
         if len(remaining) == len(rows):
@@ -113,8 +109,7 @@ class RunLogger:
             self._file = self._path.open("a")
         with writing(self._events_dir):
             self._events_dir.mkdir(exist_ok=True)
-            # The writer beneath tensorboardX.SummaryWriter, whose thread would die unheard when the disk is full, and
-            # every row from then on wait for it.
+            # tensorboardX.SummaryWriter writes by a thread that dies silently on a full disk: later rows would wait.
             self._events = RecordWriter(str(self._events_dir / f"events.out.tfevents.{int(time.time())}"))
             self._events.write(Event(wall_time=time.time(), file_version="brain.Event:2").SerializeToString())
 
@@ -140,7 +135,7 @@ class RunLogger:
 
 
 def _histogram(name: str, counts: np.ndarray) -> Any:
-    """Return the event of how often each of 1..L occurred."""
+    """Return the summary of an event from the counts of 1..L."""
     values = np.arange(1, len(counts) + 1)
     total, squares = float(counts @ values), float(counts @ values**2)
     return histogram_raw(
@@ -153,14 +148,7 @@ def _count(row: Row) -> int:
     return row["ticks"] if "ticks" in row else row["steps"]
 
 
-def _drop_half_row(path: Path) -> None:
-    """Cut what a killed run left after the last newline."""
-    if path.exists():
-        with path.open("rb+") as file:
-            file.truncate(file.read().rfind(b"\n") + 1)
-
-
 def _mean(value: Any) -> float | None:
-    """Return the mean over the seeds that are finite, or None if none is."""
+    """Return the mean over the finite seeds, or None without any."""
     numbers = [number for number in (value if isinstance(value, list) else [value]) if number is not None]
     return sum(numbers) / len(numbers) if numbers else None

@@ -1,7 +1,7 @@
 """Population-based training (Jaderberg et al., 2017) over the rows of one program.
 
-Every so many steps the worst quarter of the points takes over what a point of the best quarter has learnt, with its
-numbers perturbed. Each seed has a population of its own, so that seeds stay independent repeats.
+Every so many steps the worst quarter of the points copies the weights of points of the best quarter, and their numbers
+perturbed. Each seed has a population of its own, so that seeds stay independent repeats.
 """
 
 from collections.abc import Callable
@@ -19,14 +19,13 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from taic_jax.config import Config, replace
 from taic_jax.nonfinite import FINITE
 
-SHARE = 4
-"""One in so many points is replaced, and as many are copied."""
+SHARE = 4  # one in so many points is replaced, and one in so many is copied
 FACTORS = (0.8, 1.25)
 PREFIX, PARENT = "pbt", "pbt/parent"
 
 
 class Members(struct.PyTreeNode):
-    """The rows [G K]: what they have learnt, the numbers they learn with, their own keys, and the steps taken."""
+    """The rows [G K]: their states, the configs they train with, their own keys, and the numbers of steps."""
 
     state: Any
     config: Config
@@ -36,21 +35,21 @@ class Members(struct.PyTreeNode):
 
 @dataclass(frozen=True)
 class Population:
-    """How points evolve: `bounds` are of each number that is perturbed, by its dotted name in the config."""
+    """The evolution of points: steps between copies, and `bounds` of each perturbed number by its dotted name."""
 
     every: int
     bounds: dict[str, tuple[float, float]]
     seeds: int
 
     def begin(self, state: Any, config: Config, key: Key[Array, " R"]) -> Members:
-        """Return the rows before the first step; their randomness has keys apart from those of the stage."""
+        """Return the rows before the first step, with keys apart from those of the stage."""
         return Members(state, config, jax.vmap(lambda k: jax.random.fold_in(k, 1))(key), jnp.zeros(len(key), jnp.int32))
 
     def evolving(self, step: Callable[..., tuple[Any, dict, Any]]) -> Callable[..., tuple[Members, dict, Any]]:
         """Return a step (members, trainer) from one (states, trainer) whose metrics hold `return`.
 
-        The members' own configs take the place of the trainer's. Metrics hold the numbers that the step was taken with
-        (`pbt/NAME`), and the row that each goes on from after it (`pbt/parent`).
+        The members' own configs replace the trainer's. Metrics hold the numbers of this step (`pbt/NAME`), and the row
+        whose weights each row goes on with (`pbt/parent`).
         """
 
         def call(members: Members, trainer: Any) -> tuple[Members, dict, Any]:
@@ -61,13 +60,15 @@ class Population:
             parent = _parents(score.reshape(-1, self.seeds), key_donor)
             parent = jnp.where(count % self.every == 0, parent, jnp.arange(len(parent)))
             numbers = {f"{PREFIX}/{name}": attrgetter(name)(members.config) for name in self.bounds}
-            after = Members(_take_over(state, parent), self._explore(members.config, parent, key_factor), key, count)
+            # Each row keeps its own keys: children would draw the same numbers.
+            state = jax.tree.map(lambda x: x if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x[parent], state)
+            after = Members(state, self._explore(members.config, parent, key_factor), key, count)
             return after, metrics | numbers | {PARENT: parent.astype(jnp.float32)}, extra
 
         return call
 
     def _explore(self, config: Config, parent: Int[Array, " R"], key: Key[Array, " R"]) -> Config:
-        """Return the parents' numbers, multiplied by one of the factors where a row has another for its parent."""
+        """Return the parents' numbers, multiplied by one of the factors in rows with another row as parent."""
         moved = parent != jnp.arange(len(parent))
         up = jax.vmap(lambda k: jax.random.bernoulli(k, shape=(len(self.bounds),)))(key)
         for i, (name, (low, high)) in enumerate(self.bounds.items()):
@@ -78,7 +79,7 @@ class Population:
 
 
 def _parents(score: Float[Array, "G K"], key: Key[Array, " R"]) -> Int[Array, " R"]:
-    """Return for each row whose weights it goes on with: its own, or those of a better one of the same seed."""
+    """Return for each row the row whose weights it goes on with: itself, or a better one of the same seed."""
     points, seeds = score.shape
     few = max(points // SHARE, 1)
     score = jnp.where(jnp.isnan(score), -jnp.inf, score)
@@ -91,19 +92,8 @@ def _parents(score: Float[Array, "G K"], key: Key[Array, " R"]) -> Int[Array, " 
     return (jnp.where(worse, donor, point) * seeds + seed).reshape(-1)
 
 
-def _take_over(state: Any, parent: Int[Array, " R"]) -> Any:
-    """Return the parents' states, but each row's own keys, or children would draw the same numbers."""
-    return jax.tree.map(lambda x: x if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x[parent], state)
-
-
 def schedule(rows: list[dict[str, Any]], names: list[str], row: int) -> list[tuple[int, dict[str, float]]]:
-    """Return the numbers that the weights of one row were learnt with: (tick from which, by name), as they changed.
-
-    Args:
-      rows: the metrics of stage train, in order.
-      names: of the numbers, dotted.
-      row: of the last one.
-    """
+    """Return the history (first tick, values by dotted name) of the numbers behind the weights of one last `row`."""
     steps: list[tuple[int, dict[str, float]]] = []
     for i in reversed(range(len(rows))):
         row = int(rows[i][f"train/{PARENT}"][row])

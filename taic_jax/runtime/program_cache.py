@@ -1,4 +1,4 @@
-"""The cache of compiled programs on disk, by which a run like an earlier one starts in seconds."""
+"""The cache of compiled programs on disk: a run like an earlier one starts in seconds."""
 
 import contextlib
 from functools import cache
@@ -25,7 +25,7 @@ def keep_programs() -> None:
 
 @cache
 def compiler_options() -> dict[str, str | bool]:
-    """Return what programs are compiled with here: on a CPU `WITHOUT_YNNPACK`, where this version of XLA knows it."""
+    """Return XLA's options for programs: on a CPU `WITHOUT_YNNPACK`, if this version of XLA has the option."""
     if jax.default_backend() != "cpu":
         return {}
     try:
@@ -36,10 +36,7 @@ def compiler_options() -> dict[str, str | bool]:
 
 
 def _remove_half_written(folder: Path) -> None:
-    """Remove what a full disk or a killed process has left, which JAX would stumble over ever after.
-
-    JAX writes when a program was last used after the program itself.
-    """
+    """Remove incomplete programs, which JAX cannot read: they lack the file of their last use, written later."""
     for path in folder.glob("*-cache"):
         if not path.with_name(path.name.removesuffix("-cache") + "-atime").exists():
             path.unlink(missing_ok=True)

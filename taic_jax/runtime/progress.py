@@ -1,4 +1,4 @@
-"""What a run is doing, on standard error: a bar on a terminal, a line every 10 seconds in a log file."""
+"""Progress of a run on standard error: a bar on a terminal, a line every 10 seconds in a log file."""
 
 import contextlib
 import threading
@@ -9,30 +9,20 @@ from dataclasses import dataclass
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
-INTERVAL = 10.0
-"""Seconds between two lines."""
+INTERVAL = 10.0  # seconds between two lines
 
 
 @dataclass
 class Work:
-    """What is under way.
+    """One piece of work and its progress."""
 
-    Attributes:
-      name: of the stage, and what it does where it does not train, as in `train: compiling`.
-      total: ticks or gradient steps per seed in all; 0 where nothing can be counted.
-      done: how many were made; `first` of them before a resume.
-      unit: what they are.
-      seeds: how many make them side by side.
-      result: mean return, or nothing yet.
-    """
-
-    name: str
-    total: int = 0
-    first: int = 0
-    done: int = 0
+    name: str  # the stage, and its activity if that is not training, as in `train: compiling`
+    total: int = 0  # ticks or gradient steps per seed in all; 0 without a measure
+    first: int = 0  # units before a resume
+    done: int = 0  # units so far
     unit: str = "ticks"
-    seeds: int = 1
-    result: float | None = None
+    seeds: int = 1  # side by side
+    result: float | None = None  # mean return
 
     def __post_init__(self):
         self.began = time.monotonic()
@@ -43,12 +33,12 @@ class Work:
         return self.seeds * (self.done - self.first) / max(time.monotonic() - self.began, 1e-9)
 
     def measures(self) -> list[str]:
-        """Say how it goes: return and speed, as far as there are any."""
+        """Return the return and the speed in words, as far as there are any."""
         texts = [] if self.result is None else [f"return {self.result:,.1f}"]
         return texts + ([f"{self.rate:,.0f} {self.unit}/s"] if self.done > self.first else [])
 
     def line(self) -> str:
-        """Say all of it in one line."""
+        """Return the whole progress in one line."""
         seconds = time.monotonic() - self.began
         if not self.total:
             return f"{self.name}, {seconds:.0f} s" if seconds >= 1 else self.name
@@ -59,22 +49,17 @@ class Work:
 
 
 class Display:
-    """Show on a terminal a bar for each stage, redrawn in place, and one below that moves while something else is done.
+    """A bar on a terminal for each stage, redrawn in place, and one below that moves during other work.
 
-    In a file, write a line where work without a measure first begins, every `INTERVAL` seconds, and at the end of each
-    stage. Where `quiet`, show nothing.
+    A file gets a line at the first beginning of each work without a measure, every `INTERVAL` seconds, and at the end
+    of each stage. A `quiet` display shows nothing.
     """
 
     def __init__(self, quiet: bool):
         self._console = Console(stderr=True, quiet=quiet)
-        self._progress = Progress(
-            TextColumn("{task.description:>20}"),
-            BarColumn(bar_width=24),
-            TextColumn("{task.fields[text]}"),
-            TimeRemainingColumn(),
-            console=self._console,
-            disable=quiet or not self._console.is_terminal,
-        )
+        columns = TextColumn("{task.description:>20}"), BarColumn(bar_width=24), TextColumn("{task.fields[text]}")
+        hidden = quiet or not self._console.is_terminal
+        self._progress = Progress(*columns, TimeRemainingColumn(), console=self._console, disable=hidden)
         self._task: TaskID
         self._work: Work | None = None
         self._begun: set[str] = set()
@@ -87,7 +72,7 @@ class Display:
         self._thread.start()
 
     def stop(self) -> None:
-        """Leave what is drawn as it is, and write no more lines."""
+        """Leave the bars in place, and write no more lines."""
         self._progress.stop()
         self._ended.set()
         self._thread.join()
@@ -112,7 +97,7 @@ class Display:
                 self._progress.remove_task(task)
 
     def update(self, work: Work) -> None:
-        """Draw how far this work has come."""
+        """Draw the progress of this work."""
         if work.total:
             text = f"{work.done:,}/{work.total:,}  " + "  ".join(work.measures())
             self._progress.update(self._task, completed=work.done, text=text)
@@ -132,7 +117,7 @@ class Display:
 
 
 def _duration(seconds: float) -> str:
-    """Return a duration in words; tenths of minutes and hours where those are few."""
+    """Return a duration in words, in seconds, or tenths of minutes or hours."""
     for unit, size in (("h", 3600), ("min", 60)):
         if seconds >= 1.5 * size:
             return f"{seconds / size:.1f} {unit}"

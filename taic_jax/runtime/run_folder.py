@@ -1,4 +1,4 @@
-"""The folder of a run: its files, whose it is, and that nobody else writes in it."""
+"""The folder of a run: its files, its config, and its lock."""
 
 import contextlib
 import json
@@ -16,12 +16,11 @@ from taic_jax.config_io import load_config, to_yaml
 from taic_jax.runtime.files import PARTIAL, SaveError, remove_partial, save_json, save_text, writes_here, writing
 from taic_jax.runtime.hosts import agree
 
-LOCK = ".lock"
-"""File of a run's folder that the process at work there has locked."""
+LOCK = ".lock"  # file of a run's folder that the process writing there locks
 
 
 class Statistics(TypedDict):
-    """A quantity over seeds, as `statistics.summarize` gives it; None stands for what is not finite."""
+    """A quantity over seeds, by `statistics.summarize`; None stands for a number that is not finite."""
 
     per_seed: list[float | None]
     mean: float | None
@@ -41,11 +40,11 @@ class Durations(Statistics):
     histogram: list[float | None]
 
 
+# The evaluation of one method.
 Method = TypedDict(
     "Method",
     {"return": Returns, "return_mean_option": Returns, "duration": Durations, "metrics": dict[str, Statistics]},
 )
-"""The evaluation of one method."""
 
 
 class Summary(TypedDict):
@@ -60,16 +59,16 @@ class Summary(TypedDict):
     commit: str | None
 
 
+# A row of metrics.jsonl: `stage`, `ticks` or `steps`, `time`, and each metric, a number or a list over seeds.
 Row = dict[str, Any]
-"""A row of metrics.jsonl: `stage`, `ticks` or `steps`, `time`, and each metric, a number or a list over seeds."""
 
 
 class RunFolderError(ValueError):
-    """The run folder cannot be used in this way."""
+    """A run folder that does not fit the request."""
 
 
 class BusyError(RunFolderError):
-    """Another process is at the run folder."""
+    """A run folder that another process writes."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +94,7 @@ class RunFolder:
 
     @property
     def clock_path(self) -> Path:
-        """Seconds and ticks so far."""
+        """Seconds so far."""
         return self.path / "clock.json"
 
     @property
@@ -109,11 +108,7 @@ class RunFolder:
         return self.summary_path.is_file()
 
     def config(self) -> Config:
-        """Read the config.
-
-        Raises:
-          ConfigError: it is of another version, or none.
-        """
+        """Read the config, or raise ConfigError if it is of another version, or none."""
         return load_config(self.config_path)
 
     def summary(self) -> Summary:
@@ -121,32 +116,28 @@ class RunFolder:
         return json.loads(self.summary_path.read_text())
 
     def metrics(self, stage: str | None = None) -> list[Row]:
-        """Read the rows, of one stage where it is named; a half-written last one is left out."""
+        """Read the rows of one stage, or of all, without an incomplete last one."""
         lines = self.metrics_path.read_text().splitlines(keepends=True)
         rows = [json.loads(line) for line in lines if line.endswith("\n")]
         return [row for row in rows if stage in (None, row["stage"])]
 
     def save_summary(self, summary: Summary) -> None:
-        """Write the results; from then on the run is finished."""
+        """Write the results, which finishes the run."""
         save_json(self.summary_path, summary)
 
     @property
     def _is_used(self) -> bool:
-        """Whether anything is there but an empty folder, or what a process killed at its very start leaves."""
+        """Whether the path holds more than an empty folder, or the traces of a process killed at its very start."""
         if not self.path.is_dir():
             return self.path.exists()
         return any(path.suffix != PARTIAL and path.name != LOCK for path in self.path.iterdir())
 
     def check(self, config: Config, *, resume: bool = False, overwrite: bool = False) -> None:
-        """Check that a run can begin or resume in the folder, and change nothing.
-
-        Raises:
-          RunFolderError: it holds another run, or none where one is to be resumed or overwritten.
-        """
+        """Check, without a change, that a run can begin or resume in the folder, or raise RunFolderError."""
         if resume:
             if not self.begun:
                 raise RunFolderError(f"{self.path} holds no run to resume: no config.yaml in it")
-            old = dict(walk(self.config()))  # a field that is newer than the run has its default there
+            old = dict(walk(self.config()))  # with the defaults of fields newer than the run
             differing = [f"{name}: {value}" for name, value in walk(config) if old[name] != value]
             if differing:
                 raise RunFolderError(f"{self.path} was run with another config, differing in {differing[:1]}")
@@ -154,22 +145,15 @@ class RunFolder:
             if not overwrite:
                 raise RunFolderError(f"{self.path} already holds files; add --resume, --overwrite or another --run-dir")
             if not self.begun:
-                raise RunFolderError(
-                    f"{self.path} is not a run's folder (no config.yaml in it), so it is not overwritten"
-                )
+                why = "is not a run's folder (no config.yaml in it)"
+                raise RunFolderError(f"{self.path} {why}, so it is not overwritten")
             for name in {config.options.source, *config.options.experience} - {"", COLLECT}:
                 if Path(name).resolve().is_relative_to(self.path.resolve()):
-                    raise RunFolderError(
-                        f"{self.path} holds what this run starts from, {name}, so it is not overwritten"
-                    )
+                    why = f"holds what this run starts from, {name}"
+                    raise RunFolderError(f"{self.path} {why}, so it is not overwritten")
 
     def prepare(self, config: Config, *, resume: bool = False, overwrite: bool = False) -> None:
-        """Make the folder, or check that it is the one to resume; of several hosts the first does, and refuses for all.
-
-        Raises:
-          RunFolderError: it holds another run, or none where one is to be resumed, or cannot be written; or the hosts
-            have different configs.
-        """
+        """Make or check the folder, on the first host for all, or raise RunFolderError on every host."""
         checksum = zlib.crc32(to_yaml(config).encode()) >> 1  # a number of 31 bits
         if agree([checksum]) != agree([checksum], least=True):
             raise RunFolderError("--hosts: expected the same config on every host, got different ones")
@@ -199,13 +183,9 @@ class RunFolder:
 
     @contextlib.contextmanager
     def claimed(self) -> Iterator[None]:
-        """Keep other processes off the folder; the system gives it back when this one ends, however it ends.
+        """Lock the folder in the context, and remove the incomplete files of killed processes.
 
-        What a process that was killed here left half-written is removed.
-
-        Raises:
-          BusyError: another process is at it.
-          RunFolderError: it cannot be written.
+        The system unlocks it at any end of this process. Raise BusyError if it is locked, or RunFolderError.
         """
         if not writes_here():
             yield

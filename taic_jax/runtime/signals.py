@@ -1,4 +1,4 @@
-"""Why a run ends early: at a signal, after its iteration and saved, or because no seed is left."""
+"""Early ends of a run: at a signal, after its iteration and saved, or because no seed is left."""
 
 import signal
 import sys
@@ -7,7 +7,7 @@ from typing import Any
 
 
 class Interrupted(BaseException):  # like KeyboardInterrupt, which no `except Exception` catches either
-    """A run stopped at a signal, with all that it had done saved."""
+    """A stop at a signal, after all results are saved."""
 
     def __init__(self, received: int):
         super().__init__(signal.Signals(received).name)
@@ -15,14 +15,14 @@ class Interrupted(BaseException):  # like KeyboardInterrupt, which no `except Ex
 
 
 class DivergedError(ArithmeticError):
-    """No seed is left whose numbers are finite."""
+    """The end of the last seed with finite numbers."""
 
 
 class Signals:
     """Note SIGINT and SIGTERM while in the context, instead of ending in the middle of an iteration.
 
     After the first one the next SIGINT ends the process at once, by the system's default: Python's handlers would wait
-    until the compiled program returns. What was saved is whole either way. Only a main thread may enter the context.
+    until the compiled program returns. Files are complete either way. Only a main thread may enter the context.
     """
 
     def __init__(self) -> None:

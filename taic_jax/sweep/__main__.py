@@ -49,7 +49,7 @@ def execute(command: Command) -> int:
 
         connect(command.cluster)
     if command.optuna:
-        importlib.import_module("taic_jax.sweep.optuna_study")  # a missing one is refused before a folder is made
+        importlib.import_module("taic_jax.sweep.optuna_study")  # fails without Optuna, before a folder is made
     else:
         points = sample(axes, command.samples, config.seed) if command.samples else grid(axes)
         configs_of(config, points)
@@ -63,7 +63,7 @@ def execute(command: Command) -> int:
     shard = "none" if command.pbt and command.shard == "auto" else command.shard
     shard = open_devices(shard, config.seeds * (len(points) or command.optuna))
     check_run(sweep_config(config), command.run_dir, resume=command.resume, overwrite=command.overwrite)
-    # A sweep that is resumed keeps the chunks that it had: there is nothing to measure.
+    # A resumed sweep has its chunks: nothing needs a measurement.
     size = command.chunk or (1 if command.resume else points_that_fit(config, command.memory))
     if command.pbt and not command.resume and size < len(points):
         raise ConfigError(f"--pbt: expected its {len(points)} points to run in one program, got at most {size} at once")
@@ -87,14 +87,13 @@ def execute(command: Command) -> int:
 
 
 def _check(command: Command) -> list[Axis]:
-    """Return the axes; refuse none, one that stands twice, two strategies, and what population-based training bars."""
+    """Return the axes; refuse none, duplicates, two strategies, and anything that population-based training bars."""
     if not command.axes:
         raise ConfigError(f"--axes: expected at least one FIELD=VALUES, such as {EXAMPLE}=1e-4,1e-3")
     axes = [parse_axis(text) for text in command.axes]
     names = [axis.name for axis in axes]
-    for name in names:
-        if names.count(name) > 1:
-            raise ConfigError(f"--axes: {name} stands twice")
+    if doubled := [name for name in names if names.count(name) > 1]:
+        raise ConfigError(f"--axes: {doubled[0]} stands twice")
     if command.samples and command.optuna:
         raise ConfigError("--samples and --optuna: expected at most one of the two")
     for name in ("samples", "optuna", "pbt", "memory", "chunk"):
@@ -106,7 +105,7 @@ def _check(command: Command) -> list[Axis]:
 
 
 def _check_population(command: Command, names: list[str]) -> None:
-    """Refuse axes whose points cannot take over each other's policies, and points that are not in one program."""
+    """Refuse axes whose points cannot copy each other's policies, and options that split points over programs."""
     for name in names:
         if not (is_leaf(name) and name.startswith("train.")):
             raise ConfigError(f"--pbt: {name}: expected numbers of stage train that one program can vary, as {EXAMPLE}")

@@ -1,4 +1,4 @@
-"""Axes of a sweep: fields and their values, the points they span, and which points fit into one program."""
+"""Axes of a sweep: fields and their values, the points they span, and the chunks of points for one program."""
 
 import dataclasses
 import itertools
@@ -11,16 +11,14 @@ from taic_jax.config import Config, ConfigError, field_types, replace, walk
 from taic_jax.config_io import from_text, nearest, validate
 
 RANGE = ".."
-STATIC_FLOATS = "env."
-"""Fields that a program is built from although they are numbers: environments are made outside of it."""
+STATIC_FLOATS = "env."  # prefix of numbers that are constants of a program: environments are made outside of it
 
-Point = dict[str, Any]
-"""Values by the dotted names of their fields."""
+Point = dict[str, Any]  # values by the dotted names of their fields
 
 
 @dataclasses.dataclass(frozen=True)
 class Axis:
-    """A field and its values, or the interval that they are drawn from."""
+    """A field and its values, or an interval to draw them from."""
 
     name: str
     values: tuple[Any, ...] = ()
@@ -48,11 +46,7 @@ class Axis:
 
 
 def parse_axis(text: str) -> Axis:
-    """Read FIELD=V1,V2,... or FIELD=LOW..HIGH or FIELD=LOW..HIGH:log.
-
-    Raises:
-      ConfigError: there is no such field, a value is not of its type, or the interval is empty.
-    """
+    """Read FIELD=V1,V2,... or FIELD=LOW..HIGH or FIELD=LOW..HIGH:log, or raise ConfigError."""
     name, equals, values = text.partition("=")
     kinds, name = field_types(), name.strip().replace("-", "_")
     if name not in kinds or not equals:
@@ -80,7 +74,7 @@ def is_leaf(name: str) -> bool:
 
 
 def grid(axes: Sequence[Axis]) -> list[Point]:
-    """Return every combination of the axes' values; refuse an interval, which has no list of them."""
+    """Return every combination of the axes' values, or raise ConfigError for an interval."""
     for axis in axes:
         if axis.is_range:
             raise ConfigError(f"--axes: {axis.name}: an interval needs --samples or --optuna; a grid takes values")
@@ -95,11 +89,7 @@ def sample(axes: Sequence[Axis], count: int, seed: int) -> list[Point]:
 
 
 def configs_of(config: Config, points: Sequence[Point]) -> list[Config]:
-    """Return the config of each point.
-
-    Raises:
-      ConfigError: one is impossible; the message names the point.
-    """
+    """Return the config of each point, or raise ConfigError with the name of an impossible point."""
     result = []
     for point in points:
         result.append(config)
@@ -113,7 +103,7 @@ def configs_of(config: Config, points: Sequence[Point]) -> list[Config]:
 
 
 def chunks(points: Sequence[Point], size: int) -> list[list[int]]:
-    """Cut points, by their index, into chunks of at most `size` that differ in nothing that sets a program apart."""
+    """Cut the indices of points into chunks of at most `size` points that share every static field."""
     groups: dict[str, list[int]] = {}
     for i, point in enumerate(points):
         static = sorted((name, value) for name, value in point.items() if not is_leaf(name))

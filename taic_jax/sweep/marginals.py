@@ -1,4 +1,4 @@
-"""A picture of a sweep: for each axis, how every point did over its value."""
+"""A picture of a sweep: for each axis, the score of every point over its value."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from taic_jax.runtime.files import whole_file
+from taic_jax.runtime.files import atomic_file
 from taic_jax.sweep.axes import Axis, Point
 
 
 def draw_marginals(path: Path, axes: Sequence[Axis], points: Sequence[Point], scores: Mapping[int, float]) -> None:
-    """Draw one panel per axis: a dot per point, and the median of each value where there are few."""
+    """Draw one panel per axis: a dot per point, and a line of medians if the axis has a list of values."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(3.2 * len(axes), 3.0), layout="constrained")
@@ -20,7 +20,7 @@ def draw_marginals(path: Path, axes: Sequence[Axis], points: Sequence[Point], sc
         _draw(panel, axis, [points[i][axis.name] for i in scores], np.array(list(scores.values()), float))
         panel.set_xlabel(axis.name)
     panels[0].set_ylabel("return, interquartile mean")
-    with whole_file(path) as file:
+    with atomic_file(path) as file:
         figure.savefig(file, format="png", dpi=120)
 
 
@@ -30,7 +30,7 @@ def _draw(panel: Any, axis: Axis, values: list[Any], scores: np.ndarray) -> None
     panel.plot(x, scores, "o", color="0.4", markersize=4)
     if not axis.is_range:
         candidates = [value if numeric else str(value) for value in axis.values]
-        tried = [value for value in candidates if np.isfinite(scores[x == value]).any()]
-        panel.plot(tried, [np.nanmedian(scores[x == value]) for value in tried], "-", color="C0")
+        run = [value for value in candidates if np.isfinite(scores[x == value]).any()]
+        panel.plot(run, [np.nanmedian(scores[x == value]) for value in run], "-", color="C0")
     if numeric and x.min() > 0 and (axis.logarithmic or x.max() / x.min() >= 10):
         panel.set_xscale("log")

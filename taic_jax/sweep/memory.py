@@ -1,4 +1,4 @@
-"""How many points of a sweep fit into memory at once: measured on the programs for one row."""
+"""The number of points of a sweep that fit into memory at once, measured on the programs for one row."""
 
 from pathlib import Path
 from typing import Any
@@ -18,19 +18,13 @@ MIB = 2**20
 
 
 def points_that_fit(config: Config, memory: int) -> int:
-    """Return how many points, each with all its seeds, run in `memory` MiB; 0 stands for half of the machine's.
-
-    Raises:
-      ConfigError: not even one does.
-    """
+    """Return the number of points, with all seeds, that run in `memory` MiB (0: half of all), or raise ConfigError."""
     limit, used = (memory or machine_memory() // 2) * MIB, psutil.Process().memory_info().rss
     _, source = make_envs(config)
     ticks = experience_ticks(config.collect) if needs_collect(config) else 0
     least = 2 * experience_bytes(source, ticks) * config.seeds
-    if used + least < limit:
-        count = int((limit - used) / (row_bytes(config) * config.seeds))
-        if count:
-            return count
+    if used + least < limit and (count := int((limit - used) / (row_bytes(config) * config.seeds))):
+        return count
     raise ConfigError(
         f"--memory: expected at least {(used + least) // MIB + 1:,} MiB for one point with {config.seeds} seeds, got "
         f"{limit // MIB:,}; fewer seeds or a smaller collect.capacity take less"
@@ -38,7 +32,7 @@ def points_that_fit(config: Config, memory: int) -> int:
 
 
 def row_bytes(config: Config) -> int:
-    """Return the bytes that one row takes at most in flat PPO and in selecting windows: arguments, results, scratch."""
+    """Return the most bytes of one row in flat PPO and in selecting windows: arguments, results and scratch."""
     env, source = make_envs(config)
     rows = as_rows([config], 1)
     keys = jax.random.split(jax.random.key(0), 1)
@@ -64,7 +58,7 @@ def _step_bytes(rows: Config, env: Any, stage: str, keys: jax.Array) -> int:
 
 
 def _experience(config: Config, env: Any) -> list[Experience]:
-    """Return the shapes of the experience that options are learnt from, one row of each source."""
+    """Return the shapes of the experience for learning options, one row of each source."""
     ppo = config.collect.ppo
     ticks = min(num_blocks(config.collect) * ppo.rollout_length, config.collect.ticks // ppo.num_envs)
     shapes = [(1, ticks, ppo.num_envs, *last) for last in ([env.proprioceptive_size], [env.action_size], [], [])]

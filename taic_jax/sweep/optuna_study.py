@@ -1,4 +1,4 @@
-"""Points that Optuna suggests, with its journal on disk."""
+"""Points from Optuna, with its journal on disk."""
 
 import math
 from pathlib import Path
@@ -17,10 +17,7 @@ JOURNAL = "optuna.log"
 
 
 class Study:
-    """Suggest points along the axes from the results of earlier ones, the higher the better.
-
-    The journal is in `run_dir`; a study that is in it goes on. `seed` is the sampler's.
-    """
+    """A study that suggests points from earlier results, the higher the better, with a journal in `run_dir`."""
 
     def __init__(self, axes: list[Axis], run_dir: Path, seed: int):
         optuna.logging.set_verbosity(optuna.logging.ERROR)
@@ -32,22 +29,21 @@ class Study:
         }
         self._values = {axis.name: {str(value): value for value in axis.values} for axis in axes if not axis.is_range}
         storage = optuna.storages.JournalStorage(JournalFileBackend(str(run_dir / JOURNAL)))
-        # The points of a batch are suggested before any of them has a result: the liar keeps them apart.
+        # A batch of points is suggested before any of its results: the liar keeps them apart.
         sampler = optuna.samplers.TPESampler(seed=seed, constant_liar=True)
         self._study = optuna.create_study(
             storage=storage, study_name="sweep", direction="maximize", sampler=sampler, load_if_exists=True
         )
 
     def ask(self, count: int) -> tuple[list[int], list[Point]]:
-        """Return the numbers of so many new trials, and their points."""
+        """Return the numbers and the points of `count` new trials."""
         trials = [self._study.ask(self._space) for _ in range(count)]
-        points = [
-            {name: self._values.get(name, {}).get(value, value) for name, value in trial.params.items()}
-            for trial in trials
-        ]
-        return [trial.number for trial in trials], points
+        return [trial.number for trial in trials], [self._point(trial.params) for trial in trials]
+
+    def _point(self, params: Point) -> Point:
+        return {name: self._values.get(name, {}).get(value, value) for name, value in params.items()}
 
     def tell(self, trial: int, value: float) -> None:
-        """Report the result of a trial, unless it was reported before; one that is not finite failed."""
+        """Report the result of a trial, once; one that is not finite counts as failed."""
         failed = None if math.isfinite(value) else optuna.trial.TrialState.FAIL
         self._study.tell(trial, None if failed else value, failed, skip_if_finished=True)

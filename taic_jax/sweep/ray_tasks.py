@@ -1,4 +1,4 @@
-"""Chunks of a sweep as tasks on a Ray cluster, one a node at a time; a task of a lost node goes on on another."""
+"""Chunks of a sweep as tasks on a Ray cluster, one a node at a time; a task of a lost node resumes on another."""
 
 import logging
 import os
@@ -20,18 +20,14 @@ except ImportError:
     raise MissingExtraError("ray", "cluster") from None
 
 LOCAL = "local"
-PATIENCE = 15.0  # seconds in which a cluster must answer
-RETRIES = 100  # nodes that a task may lose
-RELEASE = 60.0  # seconds that a task waits for the process of a lost node to let go of the folder
+PATIENCE = 15.0  # seconds for a cluster to answer
+RETRIES = 100  # lost nodes per task
+RELEASE = 60.0  # seconds that a task waits for the process of a lost node to unlock the folder
 _PROBE = "import ray, sys; ray.init(sys.argv[1], logging_level='ERROR', log_to_driver=False)"
 
 
 def connect(address: str) -> None:
-    """Connect to a cluster, or start one on this machine where the address is `local`.
-
-    Raises:
-      ConfigError: it does not answer in time, or is of another version.
-    """
+    """Connect to a cluster, or start one here for `local`; raise ConfigError for a silent one or another version."""
     if address != LOCAL and (problem := _probe(address)):
         expected = f"expected the HOST:PORT of a Ray cluster, got no answer of {address} {problem}"
         raise ConfigError(f"--cluster: {expected}; {LOCAL} starts one here")
@@ -39,7 +35,7 @@ def connect(address: str) -> None:
 
 
 def _probe(address: str) -> str | None:
-    """Return why a cluster does not answer, if so; another process tries, as Ray waits longer and cannot be stopped."""
+    """Return a cluster's failure to answer, if any; by another process, as Ray waits longer and cannot be stopped."""
     command = [sys.executable, "-c", _PROBE, address]
     try:
         probe = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE)
@@ -49,10 +45,7 @@ def _probe(address: str) -> str | None:
 
 
 def run_tasks(work: Callable[..., Any], tasks: Sequence[tuple], signals: Signals | None = None) -> Iterator[Any]:
-    """Yield the result of `work(*task)` for each of the tasks, in the order in which they end.
-
-    A task takes a whole node of the smallest kind there is, and runs in this process's folder, which all nodes share.
-    """
+    """Yield the results of `work(*task)` as tasks end; each takes a node of the smallest kind, in this folder."""
     remote: Any = ray.remote(max_retries=RETRIES, scheduling_strategy="SPREAD", **_smallest_node())(_in_folder)
     waiting = [remote.remote(Path.cwd(), work, task) for task in tasks]
     try:
@@ -80,7 +73,7 @@ def _in_folder(folder: Path, work: Callable[..., Any], task: tuple) -> Any:
 
 
 def _smallest_node() -> dict[str, Any]:
-    """Return the processors that every node which has any has at least."""
+    """Return the least number of processors of each kind over the nodes that have any."""
     nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
     least = {kind: min((node[kind] for node in nodes if node.get(kind)), default=0.0) for kind in ("CPU", "GPU")}
     return {"num_cpus": least["CPU"], "num_gpus": least["GPU"]}

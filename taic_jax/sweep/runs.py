@@ -25,24 +25,20 @@ from taic_jax.sweep.marginals import draw_marginals
 
 PLAN, TABLE, BEST, MARGINALS = "plan.json", "table.csv", "best.yaml", "marginals.png"
 
-TableRow = dict[str, Any]
-"""A row of the table: a point's index and values, seeds, ticks, and statistics of its returns over seeds."""
+TableRow = dict[str, Any]  # a point's index and values, seeds, ticks, and statistics of its returns over seeds
 
 
 @dataclasses.dataclass
 class Plan:
-    """The axes and counts of a sweep, its points [G], and the chunks of their indices that run in one program each.
-
-    Points that Optuna suggests are added as it does; `trials` are its numbers of them.
-    """
+    """The axes and counts of a sweep, its points [G], and the chunks of their indices, each for one program."""
 
     axes: list[str]
     samples: int
     optuna: int
     size: int
-    points: list[Point]
+    points: list[Point]  # Optuna's are added as it suggests them
     chunks: list[list[int]]
-    trials: list[int] = dataclasses.field(default_factory=list)
+    trials: list[int] = dataclasses.field(default_factory=list)  # Optuna's numbers of the points
     pbt: int = 0
 
     def describe(self, config: Config) -> str:
@@ -70,17 +66,14 @@ def run_sweep(
 ) -> None:
     """Run the missing chunks; write the table after each, and at the end the best point and the marginal plots.
 
-    Raises:
-      Interrupted: a signal was received; resume goes on from where it came.
-      RunFolderError: the folder holds another sweep, or none to resume, or another process is at it.
+    Raise Interrupted at a signal, and RunFolderError as `RunFolder.prepare` and `RunFolder.claimed`.
     """
     config = sweep_config(config)
     if plan.pbt:
-        bounds = {axis.name: axis.bounds for axis in axes}
-        settings["population"] = Population(plan.pbt, bounds, config.seeds)
+        settings["population"] = Population(plan.pbt, {axis.name: axis.bounds for axis in axes}, config.seeds)
     RunFolder(run_dir).prepare(config, resume=resume, overwrite=overwrite)
     with RunFolder(run_dir).claimed():
-        plan = _resumed(plan, run_dir) if resume else plan
+        plan = _resume(plan, run_dir) if resume else plan
         plan.save(run_dir)
         if resume and (run_dir / BEST).is_file():
             print(f"taic_jax: {run_dir} is finished: see {run_dir / TABLE}", file=sys.stderr)
@@ -99,12 +92,12 @@ def run_sweep(
 
 
 def sweep_config(config: Config) -> Config:
-    """Return the config that all points start from: without videos."""
+    """Return the config of all points before their own fields: without videos."""
     return replace(config, "evaluate.video_ticks", 0)
 
 
 def _best_point(plan: Plan, table: list[TableRow]) -> tuple[str, Point]:
-    """Print the best point, and return it, with nothing to stand before its config."""
+    """Print and return the best point, with an empty header of its config."""
     best = max(table, key=lambda row: row["iqm"])
     point = plan.points[best["point"]]
     print(f"best: {show(point)}: {best['iqm']:.4g} ({best['low']:.4g} … {best['high']:.4g})")
@@ -112,7 +105,7 @@ def _best_point(plan: Plan, table: list[TableRow]) -> tuple[str, Point]:
 
 
 def _best_member(config: Config, plan: Plan, run_dir: Path) -> tuple[str, Point]:
-    """Print the best member of all populations, and return its schedule, as comments, and its last point."""
+    """Print the best member of all populations; return its schedule, as comments, and its last point."""
     folder = RunFolder(run_dir / "chunk-000")
     returns = np.array(folder.summary()["methods"]["taic"]["return"]["per_seed"], float)
     best = int(np.nanargmax(returns))
@@ -124,7 +117,7 @@ def _best_member(config: Config, plan: Plan, run_dir: Path) -> tuple[str, Point]
 
 
 def run_chunk(config: Config, plan: Plan, run_dir: Path, settings: dict[str, Any], chunk: int) -> list[TableRow]:
-    """Run one chunk, unless it is done, and return a row per point."""
+    """Run one chunk, unless it is finished, and return a row per point."""
     folder, indices = RunFolder(run_dir / f"chunk-{chunk:03d}"), plan.chunks[chunk]
     points = configs_of(config, [plan.points[i] for i in indices])
     if not folder.finished:
@@ -133,7 +126,7 @@ def run_chunk(config: Config, plan: Plan, run_dir: Path, settings: dict[str, Any
         except DivergedError as error:
             print(f"taic_jax: {error}", file=sys.stderr)
             save_json(folder.summary_path, {"methods": {}})
-    for name in (EXPERIENCE, "checkpoints"):  # only needed to go on; a sweep that was killed here may have left some
+    for name in (EXPERIENCE, "checkpoints"):  # only a resume needs them; a sweep killed here leaves some
         shutil.rmtree(folder.path / name, ignore_errors=True)
     if methods := folder.summary()["methods"]:
         returns = methods["taic"]["return"]
@@ -155,22 +148,18 @@ def _row(config: Config, plan: Plan, i: int, returns: np.ndarray, first: np.ndar
 
 
 def _on_cluster(work: partial, settings: dict[str, Any], batch: Sequence[int]) -> Iterator[list[TableRow]]:
-    """Run the chunks of a batch as tasks of the cluster that this process is connected to."""
+    """Run the chunks of a batch as tasks of the connected cluster."""
     from taic_jax.sweep.ray_tasks import run_tasks
 
-    theirs = {name: value for name, value in settings.items() if name != "signals"}  # signals are this process's
-    return run_tasks(work, [(theirs, chunk) for chunk in batch], settings.get("signals"))
+    remote = {name: value for name, value in settings.items() if name != "signals"}  # signals are this process's
+    return run_tasks(work, [(remote, chunk) for chunk in batch], settings.get("signals"))
 
 
 def _batches(
     config: Config, axes: list[Axis], plan: Plan, run_dir: Path, table: list[TableRow]
 ) -> Iterator[Sequence[int]]:
-    """Yield the chunks to run; with Optuna, report the table of those before it suggests the points of the next.
-
-    Chunks of one batch may run in any order, or at once.
-    """
-    chunk = len(plan.chunks)
-    yield range(chunk)
+    """Yield batches of chunks to run in any order; with Optuna, report each batch's table before the next."""
+    yield range(len(plan.chunks))
     if not plan.optuna:
         return
     from taic_jax.sweep.optuna_study import Study
@@ -180,10 +169,10 @@ def _batches(
         for row in table[reported:]:
             study.tell(plan.trials[row["point"]], row["iqm"])
         reported, first, chunk = len(table), len(plan.points), len(plan.chunks)
-        wanted = min(plan.size, plan.optuna - first)
-        if wanted <= 0:
+        count = min(plan.size, plan.optuna - first)
+        if count <= 0:
             return
-        trials, points = study.ask(wanted)
+        trials, points = study.ask(count)
         configs_of(config, points)
         plan.trials += trials
         plan.points += points
@@ -192,12 +181,8 @@ def _batches(
         yield range(chunk, len(plan.chunks))
 
 
-def _resumed(plan: Plan, run_dir: Path) -> Plan:
-    """Return the plan of the sweep in the folder; the new one where that was killed before it wrote its own.
-
-    Raises:
-      RunFolderError: there is none, or it is of other axes.
-    """
+def _resume(plan: Plan, run_dir: Path) -> Plan:
+    """Return the folder's plan, or the new one if a sweep was killed before it wrote any, or raise RunFolderError."""
     if {path.name for path in run_dir.iterdir()} == {RunFolder(run_dir).config_path.name, LOCK}:
         return plan
     try:
@@ -205,9 +190,9 @@ def _resumed(plan: Plan, run_dir: Path) -> Plan:
     except (OSError, ValueError, TypeError):
         raise RunFolderError(f"{run_dir} holds no sweep to resume: no {PLAN} in it") from None
     for name in ("axes", "samples", "optuna", "pbt"):
-        before, now = getattr(saved, name), getattr(plan, name)
-        if before != now:
-            raise RunFolderError(f"{run_dir} was run with other points: --{name} was {before}, got {now}")
+        old, new = getattr(saved, name), getattr(plan, name)
+        if old != new:
+            raise RunFolderError(f"{run_dir} was run with other points: --{name} was {old}, got {new}")
     return saved
 
 
