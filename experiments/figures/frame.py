@@ -82,13 +82,15 @@ def read_panels(
 
 
 def numbers_of(panels: dict[str, Panel], numbers: Callable[[EvidenceRows, dict[str, EvidenceRows]], Rows]) -> Rows:
-    """Return the rows that `numbers` gives of each method beside the others on its task.
-
-    P-values, under `p`, are adjusted over the tasks for each method (Holm).
-    """
+    """Return the rows of `numbers` for each method, beside the others on its task, p-values adjusted."""
     rows = [row for panel in panels.values() for runs in panel.methods.values() for row in numbers(runs, panel.methods)]
+    adjust(rows)
+    return rows
+
+
+def adjust(rows: Rows) -> None:
+    """Replace `p` by `p_holm`, adjusted over the tasks of each method (Holm)."""
     for method in {row["method"] for row in rows}:
         tested = [row for row in rows if row["method"] == method and "p" in row]
         for row, p in zip(tested, holm([row.pop("p") for row in tested]), strict=True):
             row["p_holm"] = float(p)
-    return rows
