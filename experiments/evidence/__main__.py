@@ -71,7 +71,7 @@ def do(cell: Cell, run_dir: Path, shard: Shard = "none") -> None:
     run, stages = RunFolder(folder), set(cell.stages.values())
     if run.finished:
         run.prepare(cell.config, resume=True)  # only checks that it is this run
-    elif len(stages) == 1 and not stages & {"train", "options"}:
+    elif len(cell.stages) == 1 and not stages & {"train", "options"}:
         run_flat(cell, folder, *stages, make_devices(shard, cell.config), run.begun)
     else:
         run_pipeline(cell.config, folder, resume=run.begun, shard=shard)

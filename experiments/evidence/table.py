@@ -109,8 +109,8 @@ def row_of(folder: Path, run_dir: Path, method: str, stage: str) -> dict[str, An
     if config.env.change_after:
         shares, numbers = recovery_of(logged, stage)
         curves["success"] = on_grid(logged, shares, grid).tolist()
-    return {
-        **{"task": config.env.name, "method": method, "seed": config.seed, "seeds": config.seeds, "ticks": ticks},
+    row = {"task": config.env.name, "method": method, "seed": config.seed, "seeds": config.seeds, "ticks": ticks}
+    return row | {
         "pretraining": pretraining_of(config) if stage in ("train", "transfer") else 0,
         "config": config_hash(config, run_dir),
         "fields": difference(config, run_dir),

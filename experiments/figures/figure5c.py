@@ -44,7 +44,7 @@ class Figure5c(Figure):
 
 
 def numbers(runs: EvidenceRows) -> dict[str, Any]:
-    """Return what the table of the figure says of one method."""
+    """Return the numbers of one method."""
     back, learnt = has_recovered(runs.numbers), has_learnt(runs.numbers)
     count, total = int(back.sum()), len(back)
     low, high = exact_interval(count, total)
@@ -58,7 +58,7 @@ def numbers(runs: EvidenceRows) -> dict[str, Any]:
 
 
 def around_the_change(runs: EvidenceRows, grid: np.ndarray) -> np.ndarray:
-    """Return the share of successes [K, G] at ticks counted from each seed's own change; NaN where it never came."""
+    """Return the share of successes [K, G] at ticks from each seed's own change, without the seeds that had none."""
     rows = []
     for curve, at in zip(runs.curves["success"], runs.numbers["changed_at"], strict=True):
         finite = np.isfinite(curve)
@@ -68,7 +68,7 @@ def around_the_change(runs: EvidenceRows, grid: np.ndarray) -> np.ndarray:
 
 
 def picture(methods: dict[str, EvidenceRows], rows: Rows) -> Picture:
-    """Draw the share of successes around the change, and how many seeds recovered."""
+    """Draw the share of successes around the change, and the share of seeds that recovered."""
     figure, (left, right) = plt.subplots(1, 2, figsize=(9.5, 3.8), width_ratios=(3, 1))
     grid = np.linspace(-BEFORE, AFTER, 71)
     for method, runs in methods.items():
