@@ -29,7 +29,7 @@ class BraxEnv(ForeignEnv):
 
     def __init__(self, name: str, pipeline: str = "spring"):
         with third_party():
-            from brax import envs as brax_envs  # takes seconds, so only those who want Brax wait
+            from brax import envs as brax_envs  # its import takes seconds
 
         if name not in brax_envs._envs:
             raise UnknownNameError("environment", BRAX_PREFIX + name, [BRAX_PREFIX + each for each in brax_envs._envs])

@@ -1,4 +1,4 @@
-"""Environments of libraries with Brax's interface behind `Env`: pure functions of a state that says `done`."""
+"""Environments of libraries with Brax's interface behind `Env`: pure functions of a state with `done`."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -17,7 +17,7 @@ from taic_jax.envs.third_party import third_party
 
 
 class ForeignPhysics(struct.PyTreeNode):
-    """The parts of the library's state that outlive a tick and that our `State` does not hold itself."""
+    """The parts of the library's state that outlive a tick and have no field in our `State`."""
 
     simulation: Any
     info: dict[str, Any]
@@ -86,6 +86,5 @@ class ForeignEnv(Env):
 
 
 def _strong(tree: Any) -> Any:
-    """Make every dtype strong, for a carry that is the same after reset and step."""
-    arrays = jax.tree.map(jnp.asarray, tree)
-    return jax.tree.map(lambda leaf: jax.lax.convert_element_type(leaf, leaf.dtype), arrays)
+    """Make every dtype strong, so that reset and step return the same types."""
+    return jax.tree.map(lambda x: jax.lax.convert_element_type(jnp.asarray(x), jnp.asarray(x).dtype), tree)
