@@ -11,8 +11,8 @@ from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
-# MuJoCo chooses how to draw when it is first imported. Its own choice needs a display. EGL does not, but
-# where that library is missing, to ask for it would make the import fail.
+# MuJoCo chooses its way to draw at its first import. Its own choice needs a display. EGL does not, but without that
+# library the import would fail.
 if sys.platform == "linux" and "DISPLAY" not in os.environ and ctypes.util.find_library("EGL"):
     os.environ.setdefault("MUJOCO_GL", "egl")
 
@@ -37,7 +37,7 @@ __all__ = [
 
 
 class _Task(NamedTuple):
-    """A task's constructor; its arguments are these options, and `backend` and `num_threads` for an engine."""
+    """A task's constructor, and its arguments: these options, and `backend` and `num_threads` for an engine."""
 
     make: Callable[..., Env]
     options: tuple[str, ...] = ()
@@ -63,7 +63,7 @@ _TASKS = {
 
 
 def environment_names() -> tuple[str, ...]:
-    """List the tasks of this package; `make_env` also knows others' by prefix and the user's own by file or module."""
+    """List the tasks of this package; `make_env` also makes others' by prefix and the user's own by file or module."""
     return tuple(_TASKS)
 
 

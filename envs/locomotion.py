@@ -22,9 +22,8 @@ Judgement = tuple[Float[Array, ""], dict[str, Array]]
 class Locomotion(Env):
     """Run along x: reward = dx/dt + healthy_reward - control_cost |a|^2 each tick.
 
-    Observation: qpos without the place on the ground, then qvel. Positions are read from qpos, which, unlike
-    the world positions of bodies, is current after a step. A simulation that diverges ends the episode in its
-    last finite state. For `backend` and `num_threads` see `make_physics`.
+    Observation: qpos without the place on the ground, then qvel. Positions are those of qpos, which, unlike the world
+    positions of bodies, are current after a step. A simulation that diverges ends the episode in its last finite state.
     """
 
     def __init__(self, name: str, robot: Robot, backend: str = "auto", num_threads: int = 0):
@@ -60,11 +59,7 @@ class Locomotion(Env):
         return State.first(physics, self._observe(physics), metrics)
 
     def step(self, state: State, action: Float[Array, " A"]) -> State:
-        """Simulate one tick and pay for it.
-
-        Where the engine finds the simulation unstable, the robot stays where it was, the episode ends, and metric
-        `unstable` is 1.
-        """
+        """Simulate and reward one tick; an unstable one ends the episode at its start, and metric `unstable` is 1."""
         before, after = state.physics, self.physics.step(state.physics, action)
         finite = jnp.all(jnp.isfinite(jnp.concatenate([after.qpos, after.qvel])))
         after = self._advance(before, jax.tree.map(lambda new, old: jnp.where(finite, new, old), after, before))

@@ -24,33 +24,22 @@ _WARP_CAPACITY = {"naconmax": 32 * 8192, "njmax": 200}
 class MjxPhysics(Physics):
     """Steps of MJX on a template `mjx.Data`, of which only `PhysicsState` and the controls change.
 
-    Fewer solver iterations are faster and soon wrong: with a single one, the ant's joint velocities are off by
-    10 rad/s within a tick. Of the line search, 4 iterations change nothing measurable. For the arguments see
-    `make_physics`.
-
-    Raises:
-      MissingExtraError: for `warp`, its package is not installed or JAX has no NVIDIA device.
+    Fewer solver iterations are faster and soon wrong: with one, the ant's joint velocities are off by 10 rad/s within a
+    tick. Of the line search, 4 iterations change nothing measurable. For arguments and errors see `make_physics`.
     """
 
     def __init__(
-        self,
-        model: mujoco.MjModel,
-        substeps: int,
-        iterations: int | None = None,
-        ls_iterations: int | None = None,
-        *,
-        warp: bool = False,
-    ):
+        self, model: mujoco.MjModel, substeps: int, iterations: int | None = None, ls_iterations: int | None = None,
+        *, warp: bool = False,
+    ):  # fmt: skip
         if warp:
             _require_warp()
         super().__init__(model, substeps)
         impl = "warp" if warp else "jax"
         with third_party():
             mjx_model = mjx.put_model(model, impl=impl)
-            option = mjx_model.opt.replace(
-                iterations=iterations or mjx_model.opt.iterations,
-                ls_iterations=ls_iterations or mjx_model.opt.ls_iterations,
-            )
+            settings = {"iterations": iterations, "ls_iterations": ls_iterations}
+            option = mjx_model.opt.replace(**{name: value for name, value in settings.items() if value})
             if warp:  # or each step that takes all its iterations prints a line for every simulation
                 option = option.tree_replace({"_impl.warn_overflow": 0})
             self._model = mjx_model.replace(opt=option)
