@@ -44,8 +44,7 @@ class Arguments:
     """Tasks to draw, by any name that make_env takes; none means all of this package."""
     contact_sheet: Annotated[Path | None, tyro.conf.arg(metavar="FILE.png")] = None
     """Also write one picture that shows all tasks with their names."""
-    ticks: int = 100
-    """Length of the animations."""
+    ticks: int = 100  # Length of the animations.
 
 
 class ArgumentError(ValueError):

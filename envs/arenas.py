@@ -1,7 +1,7 @@
 """The three arenas of HIRO as data, and the ant's model in one of them.
 
-Each is a rectangular room with at most three solids (a bar, pillars or platforms, all 4 m high) and perhaps a
-movable block. The outer walls are four planes, the cheapest shape to collide with, and solids are boxes.
+Each is a rectangular room with at most three solids (a bar, pillars or platforms, all 4 m high) and at most one movable
+block. The outer walls are four planes, the cheapest shape for collisions, and solids are boxes.
 """
 
 import dataclasses
@@ -55,33 +55,24 @@ class Arena:
     block: Block | None = None
 
 
-MAZE = Arena(
-    room=(-4.0, -4.0, 20.0, 20.0),
-    solids=((-4.0, 4.0, 12.0, 12.0),),
-    goal=(0.0, 16.0),
-    near_goal=(16.0, 0.0),  # as far off, but at the end of the first corridor
+MAZE = Arena(  # the near goal is as far off, but at the end of the first corridor
+    room=(-4.0, -4.0, 20.0, 20.0), solids=((-4.0, 4.0, 12.0, 12.0),), goal=(0.0, 16.0), near_goal=(16.0, 0.0)
 )
+_ALONG_X, _ALONG_Y = Slide((1.0, 0.0, 0.0), (-8.0, 8.0), 1.0), Slide((0.0, 1.0, 0.0), (-8.0, 8.0), 1.0)
 PUSH = Arena(
     room=(-12.0, -4.0, 12.0, 20.0),
     solids=((4.0, -4.0, 12.0, 4.0), (-12.0, 12.0, -4.0, 20.0), (4.0, 12.0, 12.0, 20.0)),
     goal=(0.0, 19.0),
-    block=Block(
-        centre=(0.0, 8.0, 2.0),
-        slides=(Slide((1.0, 0.0, 0.0), (-8.0, 8.0), 1.0), Slide((0.0, 1.0, 0.0), (-8.0, 8.0), 1.0)),
-        meets=(0, 1, 2),
-    ),
+    block=Block(centre=(0.0, 8.0, 2.0), slides=(_ALONG_X, _ALONG_Y), meets=(0, 1, 2)),
 )
+# The block of the fall may rise a little: a limit at 0 would press it against the platform. Its fall is not damped.
+_DOWN = Slide((0.0, 0.0, 1.0), (-4.0, 0.1), 0.0)
 FALL = Arena(
     room=(-4.0, -4.0, 12.0, 28.0),
     solids=((-4.0, -4.0, 12.0, 12.0), (-4.0, 20.0, 12.0, 28.0)),  # platforms before and behind a chasm 4 m deep
     goal=(0.0, 27.0, 4.5),
     ground=4.0,
-    block=Block(
-        centre=(8.0, 8.0, 6.0),
-        # It may rise a little: a limit at 0 would press it against the platform. Its fall is not damped.
-        slides=(Slide((0.0, 1.0, 0.0), (-8.0, 8.0), 1.0), Slide((0.0, 0.0, 1.0), (-4.0, 0.1), 0.0)),
-        meets=(0,),
-    ),
+    block=Block(centre=(8.0, 8.0, 6.0), slides=(_ALONG_Y, _DOWN), meets=(0,)),
 )
 
 

@@ -15,8 +15,7 @@ from taic_jax.envs.rendering import render_mujoco
 from taic_jax.envs.robots import Robot, compile_spec, initial_qpos, load_spec
 from taic_jax.envs.views import Views, make_views
 
-Judgement = tuple[Float[Array, ""], dict[str, Array]]
-"""A reward, or a term of it, and metrics."""
+Judgement = tuple[Float[Array, ""], dict[str, Array]]  # A reward, or a term of it, and metrics.
 
 
 class Locomotion(Env):

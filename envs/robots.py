@@ -91,8 +91,7 @@ def _as_in_gym(robot: Robot, file: str) -> Robot:
     )
 
 
-BODIES = ("gym", "hiro")
-"""Bodies of the ant, by the config's `env.body`."""
+BODIES = ("gym", "hiro")  # Bodies of the ant, by the config's `env.body`.
 
 # Robots by the config's `env.model`. `gym` is Gymnasium's own MJCF, integrator and rules of version 5, without the
 # ant's contact forces, which MJX does not compute and which cost at most 42 an episode.

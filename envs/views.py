@@ -31,8 +31,7 @@ class Views(struct.PyTreeNode):
         return action[..., self.action_order[view]] * jnp.broadcast_to(self.action_sign[view], action.shape)
 
 
-Signed = tuple[tuple[int, int], ...]
-"""For each entry the index of the one that takes its place, and its sign."""
+Signed = tuple[tuple[int, int], ...]  # For each entry the index of the one that takes its place, and its sign.
 
 
 def one_view(obs_size: int, action_size: int) -> Views:

@@ -13,14 +13,9 @@ BACKENDS = ("auto", "mujoco", "mjx", "warp")
 
 
 def make_physics(
-    model: MjModel,
-    substeps: int,
-    backend: str = "auto",
-    num_threads: int = 0,
-    *,
-    iterations: int | None = None,
-    ls_iterations: int | None = None,
-) -> Physics:
+    model: MjModel, substeps: int, backend: str = "auto", num_threads: int = 0,
+    *, iterations: int | None = None, ls_iterations: int | None = None,
+) -> Physics:  # fmt: skip
     """Load a model on a backend.
 
     Args:

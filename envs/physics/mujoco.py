@@ -58,11 +58,11 @@ class MujocoPhysics(Physics):
         nq, nv = self.model.nq, self.model.nv
         sent = jnp.concatenate([state.qpos, state.qvel, state.qacc_warmstart, ctrl])
         # `pure_callback` serves accelerators and an XLA that refuses our host calls. On CPU it takes ten times as long
-        # to hand arrays over as a host call, which steps in XLA's own memory.
-        shape = jax.ShapeDtypeStruct((self.engine.num_returned,), jnp.float32)
+        # to pass arrays as a host call, which steps in XLA's own memory.
+        call, size = self.engine.call, self.engine.num_returned
+        shape = jax.ShapeDtypeStruct((size,), jnp.float32)
         elsewhere = functools.partial(jax.pure_callback, self.engine.copied_step, shape, vmap_method="broadcast_all")
-        call = self.engine.call
-        here = elsewhere if call is None else functools.partial(call, size=self.engine.num_returned)
+        here = elsewhere if call is None else functools.partial(call, size=size)
         after = jax.lax.platform_dependent(sent, cpu=here, default=elsewhere)
         return state.replace(qpos=after[:nq], qvel=after[nq : nq + nv], qacc_warmstart=after[nq + nv :])
 

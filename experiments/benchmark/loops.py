@@ -26,13 +26,10 @@ from taic_jax.types import as_arrays
 
 WORK = PPOConfig(num_envs=64, rollout_length=256, epochs=10, minibatch_size=512)
 """An iteration of training, everywhere here: 64 x 256 ticks, 10 epochs of 32 minibatches, 64x64 networks."""
-VARIABLE_LENGTH = 10
-"""The most ticks of an option that may end earlier; those of termination fixed are 5 ticks long."""
-EXPERIENCE = 16, 1024
-"""Environments, and ticks of each, that options are learnt from."""
+VARIABLE_LENGTH = 10  # The most ticks of an option that may end earlier; those of termination fixed are 5 ticks long.
+EXPERIENCE = 16, 1024  # Environments, and ticks of each, that options are learnt from.
 ONE_DEVICE = Devices()
-ITERATIONS = 100
-"""Iterations over which the step size decays; one is measured."""
+ITERATIONS = 100  # Iterations over which the step size decays; one is measured.
 
 
 def has_engine(env: envs.Env) -> bool:

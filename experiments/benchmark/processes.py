@@ -27,8 +27,7 @@ from taic_jax.runtime.program_cache import keep_programs
 from taic_jax.runtime.run_folder import RunFolder
 from taic_jax.types import as_arrays, as_rows
 
-PATIENCE = 600.0
-"""Seconds after which a run that has logged nothing is stopped."""
+PATIENCE = 600.0  # Seconds after which a run that has logged nothing is stopped.
 POLL = 0.02
 
 

@@ -21,8 +21,7 @@ from taic_jax.runtime.checkpoint import Checkpoints
 
 FACTORS = (1, 4, 16)
 SMALLEST = {"environments": 16, "seeds": 1, "option length": 2, "observation size": 8}
-SAVED = 10
-"""Iterations in a call of `saving_loop`."""
+SAVED = 10  # Iterations in a call of `saving_loop`.
 
 
 def shares(env: envs.Env, config: PPOConfig, rounds: int) -> dict[str, float]:

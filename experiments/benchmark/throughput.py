@@ -27,8 +27,7 @@ from taic_jax.experiments.benchmark.timing import Speeds, Ticking, interleave
 from taic_jax.options.execution import Executor
 
 HEADLINE = "option_training"
-PAPER = ("fixed", "open")
-"""The options of the row that stands for option training: the paper's."""
+PAPER = ("fixed", "open")  # The options of the row that stands for option training: the paper's.
 
 
 @dataclasses.dataclass(frozen=True)

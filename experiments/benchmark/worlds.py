@@ -56,8 +56,7 @@ def plain_mjx(env: envs.Env, actions: jax.Array) -> Loop:
     return Loop(partial(jax.jit(run), data), actions[..., 0].size)
 
 
-BARE = {"mujoco": bare_engine, "mjx": plain_mjx}
-"""Warp has none: its data cannot be passed in as a batch."""
+BARE = {"mujoco": bare_engine, "mjx": plain_mjx}  # Warp has none: its data cannot be passed in as a batch.
 
 
 def measure(arguments: Arguments, task: str, backend: str) -> Row:

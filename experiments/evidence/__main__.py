@@ -34,12 +34,9 @@ class Arguments:
 
     only: tuple[str, ...] = ()
     """Do only the runs whose names start so, as in half_cheetah or half_cheetah/strong; empty does all."""
-    list: bool = False
-    """List every run and its progress, and stop."""
-    table: Path = TABLE
-    """The table."""
-    run_dir: Path = Path("runs/evidence")
-    """Folder of the runs."""
+    list: bool = False  # List every run and its progress, and stop.
+    table: Path = TABLE  # The table.
+    run_dir: Path = Path("runs/evidence")  # Folder of the runs.
 
 
 def sources(cell: Cell, run_dir: Path) -> set[str]:

@@ -31,22 +31,14 @@ SPACE_MEASURES = (
     "window/mlp_r2/end", "window/mutual_information/change", "window/mutual_information/permuted",
 )  # fmt: skip
 PREFIX = "space/"
-COUNT = 500
-"""Options of each kind that are measured."""
-SHOWN = 300
-"""Options of the example."""
-STEPS = 11
-"""Codes from one window's to another's, both included."""
-SWEEP = np.linspace(-2.0, 2.0, 9)
-"""Changes of one dimension of a code, in standard deviations of the prior."""
-PAIRS = 100
-"""Pairs of windows, and codes whose dimensions are changed, of each option model."""
-EPISODES = 100
-"""Fewest episodes of a share of successes."""
-AFTER = 200_000
-"""Ticks after the change in which a method may recover: 1000 episodes of the longest kind."""
-RECOVERED = 0.9
-"""Share of these last episodes that reach the goal if a seed has recovered."""
+COUNT = 500  # Options of each kind that are measured.
+SHOWN = 300  # Options of the example.
+STEPS = 11  # Codes from one window's to another's, both included.
+SWEEP = np.linspace(-2.0, 2.0, 9)  # Changes of one dimension of a code, in standard deviations of the prior.
+PAIRS = 100  # Pairs of windows, and codes whose dimensions are changed, of each option model.
+EPISODES = 100  # Fewest episodes of a share of successes.
+AFTER = 200_000  # Ticks after the change in which a method may recover: 1000 episodes of the longest kind.
+RECOVERED = 0.9  # Share of these last episodes that reach the goal if a seed has recovered.
 
 
 def each_model(folder: Path) -> Iterator[tuple[OptionModel, Experience, Array]]:

@@ -9,8 +9,7 @@ import numpy as np
 from taic_jax.analysis.statistics import bootstrap_interval, iqm, probability_of_improvement
 from taic_jax.runtime.files import save_table
 
-DIGITS = 5
-"""Significant digits of every number in a table."""
+DIGITS = 5  # Significant digits of every number in a table.
 BOUNDS = ("", "_low", "_high")
 
 

@@ -16,11 +16,9 @@ RECOVERY = "nav2d"
 # Interactions with the task; flat PPO of method long has twice as many.
 TICKS = {"ant": 2_000_000} | dict.fromkeys(TRANSFERS, 3_000_000)
 MILLION = 1_000_000
-CAPACITY = MILLION
-"""Ticks of experience; of Ant's two million the second half, which has all its windows."""
+CAPACITY = MILLION  # Ticks of experience; of Ant's two million the second half, which has all its windows.
 FIRST_SEED = 200
-PATHS = "paths"
-"""Method of the row with the paths of the room's options."""
+PATHS = "paths"  # Method of the row with the paths of the room's options.
 
 # In open loop P is surprised far more often in execution than on its training data: with a quantile of the latter,
 # options last 2 ticks, with this error about 5. In closed loop it errs less: with that error Hopper's last 9.9 of 10
@@ -66,8 +64,7 @@ TRANSFERRED = {"open": ("options of Ant, open loop", "train"), "closed": ("optio
                "transfer": ("flat PPO from Ant's policy", "transfer")}  # fmt: skip
 RECOVERING = {"options": ("options", "train"), "flat": ("flat PPO", "flat")}
 
-Key = tuple[str, str, int]
-"""Task, method and first seed, which identify a row."""
+Key = tuple[str, str, int]  # Task, method and first seed, which identify a row.
 
 
 class Cell(NamedTuple):

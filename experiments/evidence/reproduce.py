@@ -42,10 +42,8 @@ class Arguments:
 
     again: Annotated[Path, tyro.conf.Positional]
     """The table of the reproduced rows, by `evidence --table`."""
-    table: Path = TABLE
-    """The table to compare with."""
-    out: Path = RESULTS / "again.csv"
-    """The comparison."""
+    table: Path = TABLE  # The table to compare with.
+    out: Path = RESULTS / "again.csv"  # The comparison.
 
 
 def counterpart(row: dict[str, Any], rows: Sequence[dict[str, Any]]) -> dict[str, Any]:

@@ -36,8 +36,7 @@ from taic_jax.types import as_arrays
 
 CODES, STARTS = 64, 8
 """Codes of each model, and starts of each code."""
-SECONDS = 3.0
-"""Time under one code."""
+SECONDS = 3.0  # Time under one code.
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,8 +45,7 @@ class Arguments:
 
     runs: tyro.conf.Positional[tuple[Path, ...]]
     """Folders of finished runs whose options are of the ant."""
-    out: Path = RESULTS / "steering.csv"
-    """The table of numbers."""
+    out: Path = RESULTS / "steering.csv"  # The table of numbers.
 
 
 class Unending(Wrapper):

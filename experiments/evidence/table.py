@@ -21,12 +21,9 @@ from taic_jax.runtime.run_folder import Row, RunFolder
 
 RESULTS = Path("experiments/results")
 TABLE = RESULTS / "evidence.jsonl"
-GRID = 50
-"""Points of a curve, equally far apart; the last is the end of training."""
-EARLIER_DEFAULTS = {"collect.capacity": 1_000_000}
-"""Of fields whose default has changed since the first row."""
-OWN = ("seed", "seeds")
-"""Fields of the seeds alone."""
+GRID = 50  # Points of a curve, equally far apart; the last is the end of training.
+EARLIER_DEFAULTS = {"collect.capacity": 1_000_000}  # Of fields whose default has changed since the first row.
+OWN = ("seed", "seeds")  # Fields of the seeds alone.
 
 
 class TableError(ValueError):

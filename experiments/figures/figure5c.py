@@ -19,8 +19,7 @@ from taic_jax.experiments.figures import drawing
 from taic_jax.experiments.figures.frame import Figure, Rows
 
 SEEDS = 50
-BEFORE = 80_000
-"""Ticks before the change that are drawn."""
+BEFORE = 80_000  # Ticks before the change that are drawn.
 COLOURS = {"options": drawing.RED, "flat": drawing.BLACK}
 
 

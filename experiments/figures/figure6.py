@@ -37,8 +37,7 @@ class Figure6(Figure):
     """Draw figure 6, and write its numbers."""
 
     number = "6"
-    task: str = "half_cheetah"
-    """The robot."""
+    task: str = "half_cheetah"  # The robot.
 
     def draw(self, rows: Rows) -> tuple[Picture, Rows]:
         """Return the picture and its numbers."""

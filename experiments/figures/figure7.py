@@ -32,10 +32,8 @@ class Figure7(Figure):
         *(f"improvement_of_means{name}{bound}" for name in ("", "_at_same_total") for bound in BOUNDS), "remarks",
     )  # fmt: skip
 
-    tasks: tuple[str, ...] = ROBOTS
-    """Panels."""
-    methods: tuple[str, ...] = tuple(METHODS)
-    """Curves."""
+    tasks: tuple[str, ...] = ROBOTS  # Panels.
+    methods: tuple[str, ...] = tuple(METHODS)  # Curves.
 
     def draw(self, rows: Rows) -> tuple[Picture, Rows]:
         """Return the picture and its numbers."""

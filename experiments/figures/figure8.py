@@ -25,11 +25,9 @@ SEEDS = 10
 COLOURS = {"open": ORANGE, "closed": RED, "tuned": PURPLE, "flat": BLACK, "transfer": BLUE}
 BASELINES = ("flat", "transfer")
 MEASURES = ("first", "last", "mean_option", "final/success", "final/closest_approach", "final/upside_down")
-LATE = 5
-"""Last points of a curve whose mean is a measure of training."""
+LATE = 5  # Last points of a curve whose mean is a measure of training.
 CURVES = {"return": "training/return", "mean/success": "training/success"}
-LOWER = ("final/closest_approach", "final/upside_down")
-"""Measures whose lower values are better."""
+LOWER = ("final/closest_approach", "final/upside_down")  # Measures whose lower values are better.
 COMPARED = (*BASELINES, "open")
 
 
@@ -44,8 +42,7 @@ class Figure8(Figure):
         "p_holm", "seeds_at_goal", "per_seed", "remarks",
     )  # fmt: skip
 
-    tasks: tuple[str, ...] = TRANSFERS
-    """Panels."""
+    tasks: tuple[str, ...] = TRANSFERS  # Panels.
 
     def draw(self, rows: Rows) -> tuple[Picture, Rows]:
         """Return the picture and its numbers."""

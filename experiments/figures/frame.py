@@ -12,8 +12,7 @@ from taic_jax.experiments.evidence.numbers import write_numbers
 from taic_jax.experiments.evidence.table import RESULTS, TABLE, EvidenceRows, TableError, read_table, select
 from taic_jax.experiments.figures.drawing import save, styled
 
-Rows = list[dict[str, Any]]
-"""Rows of the table of finished runs, or of the numbers of a figure."""
+Rows = list[dict[str, Any]]  # Rows of the table of finished runs, or of the numbers of a figure.
 
 
 class Panel(NamedTuple):
@@ -30,8 +29,7 @@ class Figure:
     number: ClassVar[str]
     fields: ClassVar[tuple[str, ...]] = ()
 
-    table: Path = TABLE
-    """The table of finished runs."""
+    table: Path = TABLE  # The table of finished runs.
     out: Path | None = None
     """The picture, by default experiments/results/figureN.png; its numbers are written beside it as CSV."""
 

@@ -41,10 +41,8 @@ Made by `python -m taic_jax.experiments.figures table`.
 class OptionTable:
     """Write the table of all kinds of options."""
 
-    table: Path = TABLE
-    """The table of finished runs."""
-    out: Path = RESULTS / "options.md"
-    """The file, in Markdown."""
+    table: Path = TABLE  # The table of finished runs.
+    out: Path = RESULTS / "options.md"  # The file, in Markdown.
 
     def make(self) -> None:
         """Write the table."""

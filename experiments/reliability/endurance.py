@@ -22,8 +22,7 @@ import tyro
 from taic_jax.runtime.run_folder import RunFolder
 
 POLL = 5.0
-SETTLED = 0.2
-"""Share of a stage's samples in each of the two medians that are compared."""
+SETTLED = 0.2  # Share of a stage's samples in each of the two medians that are compared.
 
 
 class Sample(NamedTuple):

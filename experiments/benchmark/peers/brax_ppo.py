@@ -16,8 +16,7 @@ from taic_jax.envs.third_party import third_party
 Pipeline = Literal["spring", "positional", "generalized", "mjx"]
 """Brax's engines, from the simplest physics to MuJoCo's."""
 PIPELINES: tuple[Pipeline, ...] = get_args(Pipeline)
-ITERATIONS = 3
-"""After the first, which compiles."""
+ITERATIONS = 3  # After the first, which compiles.
 
 
 class DoesNotRunError(Exception):
