@@ -32,11 +32,8 @@ POLL = 0.02
 
 
 def starts(task: str) -> dict[str, float]:
-    """Return the seconds to the next logged iteration: with an empty cache, with a filled one, and resumed with that.
-
-    Raises:
-      RuntimeError: a run ended, or logged nothing.
-    """
+    """Return the seconds to the next logged iteration: with an empty cache, with a filled one, and resumed with that;
+    raise `RuntimeError` if a run ends or logs nothing."""
     with tempfile.TemporaryDirectory() as folder:
         cold, warm = Path(folder) / "cold-run", Path(folder) / "warm-run"
         runs = {"cold": (cold,), "warm": (warm,), "resumed": (warm, "--resume")}
@@ -79,15 +76,11 @@ class SeedsApart:
         self.ticks, self.duration = seeds * config.num_envs * config.rollout_length, 1.0
         self._pipe, theirs = context.Pipe()
         arguments = (theirs, make_env, config, seeds, options)
-        context.Process(target=_serve, args=arguments, daemon=True).start()  # which ends when this process does
+        context.Process(target=_serve, args=arguments, daemon=True).start()  # a daemon ends with this process
         theirs.close()
 
     def __call__(self) -> None:
-        """Train for one iteration.
-
-        Raises:
-          RuntimeError: the process has failed.
-        """
+        """Train for one iteration; raise `RuntimeError` if the process has failed."""
         try:
             self._pipe.send(None)
             self.duration = self._pipe.recv()

@@ -95,12 +95,12 @@ def measure(arguments: Arguments, env: envs.Env) -> dict[str, dict[str, Any]]:
 
     A loop that does not run has a remark alone.
     """
-    measured, remarks = our_loops(arguments, env), {}
+    all_loops, remarks = our_loops(arguments, env), {}
     if arguments.peers:
         others, remarks = peers.loops(arguments.task, arguments.training)
-        measured |= others
-    speeds = interleave(measured, arguments.rounds)
-    for name, loop in measured.items():
+        all_loops |= others
+    speeds = interleave(all_loops, arguments.rounds)
+    for name, loop in all_loops.items():
         if isinstance(loop, Training | SeedsApart) and HEADLINE in name:
             remarks[name] = f"{loop.duration:.1f} ticks a decision"
     if arguments.peers:
@@ -158,8 +158,7 @@ def report(arguments: Arguments) -> dict[str, Any]:
         figures["scaling"] = show(scaling(env, arguments.training, arguments.steps, arguments.rounds))
     if arguments.sweep:
         config = load_config("nav2d").train.ppo if arguments.task == "nav2d" else arguments.training
-        costs = sweep_costs(Sweep(arguments.task, 64, 4, arguments.sweep_ticks, config), 8)
-        figures["sweep"] = costs
+        figures["sweep"] = costs = sweep_costs(Sweep(arguments.task, 64, 4, arguments.sweep_ticks, config), 8)
         ways = ("one_program", "loop", "processes")
         show({"sweep": way, "seconds": costs[way], "ratio": costs[way] / costs["one_program"]} for way in ways)
         show([costs])

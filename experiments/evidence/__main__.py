@@ -46,12 +46,8 @@ def sources(cell: Cell, run_dir: Path) -> set[str]:
 
 
 def plan(cells: Sequence[Cell], only: tuple[str, ...], present: Set[Key], run_dir: Path) -> list[Cell]:
-    """Return the runs to do, after their unfinished sources and those of the sources; a run without rows is done only
-    as a source.
-
-    Raises:
-        TableError: no run has such a name.
-    """
+    """Return the runs to do, after their unfinished sources and those of the sources; raise `TableError` if no run has
+    such a name. A run without rows is done only as a source."""
     unknown = [text for text in only if not any(cell.name.startswith(text) for cell in cells)]
     if unknown:
         raise TableError(f"--only: expected the start of a run's name, got {unknown[0]}; --list shows them")

@@ -134,12 +134,9 @@ def measure_paths(config: OptionsConfig, model: OptionModel, experience: Experie
     drawn = np.asarray(as_path(actions))
     example = {"interpolated": paths[0][0], "between": drawn[[0, PAIRS]]}
     example |= {"swept": paths[2][0][order], "original": drawn[0]}
-    return {
-        "smoothness": float(straightness(paths[0]).mean()),
-        "shuffled": float(straightness(paths[1]).mean()),
-        "effect": effect[order].tolist(),
-        "example": {name: value.tolist() for name, value in example.items()},
-    }
+    smoothness, shuffled = (float(straightness(x).mean()) for x in paths[:2])
+    numbers = {"smoothness": smoothness, "shuffled": shuffled, "effect": effect[order].tolist()}
+    return numbers | {"example": {name: value.tolist() for name, value in example.items()}}
 
 
 def measure_run_paths(folder: Path) -> dict[str, Any]:

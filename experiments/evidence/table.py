@@ -55,13 +55,13 @@ def difference(config: Config, run_dir: Path) -> dict[str, Any]:
     default = dict(walk(Config())) | EARLIER_DEFAULTS
     fields = {name: value for name, value in walk(config) if name not in OWN and value != default[name]}
 
-    def named(text: str) -> str:
+    def name_of(text: str) -> str:
         return text.removeprefix(f"{run_dir}/").removesuffix(f"-{config.seed}")
 
     if "options.experience" in fields:
-        fields["options.experience"] = [named(text) for text in fields["options.experience"]]
+        fields["options.experience"] = [name_of(text) for text in fields["options.experience"]]
     if "options.source" in fields:
-        fields["options.source"] = named(fields["options.source"])
+        fields["options.source"] = name_of(fields["options.source"])
     return fields
 
 
@@ -106,26 +106,20 @@ def row_of(folder: Path, run_dir: Path, method: str, stage: str) -> dict[str, An
     if config.env.change_after:
         shares, numbers = recovery_of(logged, stage)
         curves["success"] = on_grid(logged, shares, grid).tolist()
-    row = {"task": config.env.name, "method": method, "seed": config.seed, "seeds": config.seeds, "ticks": ticks}
-    return row | {
-        "pretraining": pretraining_of(config) if stage in ("train", "transfer") else 0,
-        "config": config_hash(config, run_dir),
-        "fields": difference(config, run_dir),
-        "versions": summary["versions"],
-        "commit": summary["commit"],
-        "seconds": round(summary["seconds"]["run"]),
-        "stopped": summary["stopped"].get(stage, {}),
-        "grid": grid.tolist(),
-        "curves": curves,
-        "numbers": {
-            "first": evaluated["return"]["first_per_seed"],
-            "last": evaluated["return"]["per_seed"],
-            "mean_option": evaluated["return_mean_option"]["per_seed"],
-            "duration": evaluated["duration"]["per_seed"],
-            **{name: value["per_seed"] for name, value in evaluated["metrics"].items()},
-            **numbers,
-        },
+    row: dict[str, Any] = {"task": config.env.name, "method": method, "seed": config.seed, "seeds": config.seeds}
+    row |= {"ticks": ticks, "pretraining": pretraining_of(config) if stage in ("train", "transfer") else 0}
+    row |= {"config": config_hash(config, run_dir), "fields": difference(config, run_dir)}
+    row |= {"versions": summary["versions"], "commit": summary["commit"], "seconds": round(summary["seconds"]["run"])}
+    row |= {"stopped": summary["stopped"].get(stage, {}), "grid": grid.tolist(), "curves": curves}
+    row["numbers"] = {
+        "first": evaluated["return"]["first_per_seed"],
+        "last": evaluated["return"]["per_seed"],
+        "mean_option": evaluated["return_mean_option"]["per_seed"],
+        "duration": evaluated["duration"]["per_seed"],
+        **{name: value["per_seed"] for name, value in evaluated["metrics"].items()},
+        **numbers,
     }
+    return row
 
 
 def pretraining_of(config: Config) -> int:
@@ -141,10 +135,8 @@ def curves_of(rows: Sequence[Row], stage: str, grid: np.ndarray) -> dict[str, li
     """
     names = [name for name in (f"{stage}/return", f"{stage}/mean/success") if name in rows[0]]
     values = {name: np.array([row[name] for row in rows], float).T for name in names}
-    return {
-        name.removeprefix(f"{stage}/"): (mean_on_grid if "mean" in name else on_grid)(rows, value, grid).tolist()
-        for name, value in values.items()
-    }
+    on = {name: mean_on_grid if "mean" in name else on_grid for name in names}
+    return {name.removeprefix(f"{stage}/"): on[name](rows, values[name], grid).tolist() for name in names}
 
 
 def mean_on_grid(rows: Sequence[Row], values: np.ndarray, grid: np.ndarray) -> np.ndarray:
