@@ -68,25 +68,15 @@ def environment_names() -> tuple[str, ...]:
 
 
 def environment_options(name: str) -> tuple[str, ...]:
-    """List the options of `make_env` that a task takes, besides backend and number of threads.
-
-    Raises:
-      UnknownNameError: if there is no such task; the message names the nearest.
-    """
+    """List the options of `make_env` for a task, besides backend and number of threads; raise `UnknownNameError` if
+    there is no such task."""
     return _find(name).options
 
 
 def make_env(
-    name: str,
-    backend: str = "auto",
-    *,
-    num_threads: int = 0,
-    pipeline: str = "spring",
-    model: str = "brax",
-    body: str = "gym",
-    goal: str = "fixed",
-    change_after: int = 0,
-) -> Env:
+    name: str, backend: str = "auto", *, num_threads: int = 0, pipeline: str = "spring", model: str = "brax",
+    body: str = "gym", goal: str = "fixed", change_after: int = 0,
+) -> Env:  # fmt: skip
     """Make a task by name, with its time limit.
 
     Args:
@@ -101,10 +91,10 @@ def make_env(
       change_after: episodes after which the room of `nav2d` changes; 0 for never.
 
     Raises:
-      UnknownNameError: if there is no such task or value; the message names the nearest.
-      EnvOptionError: if the task has no such option.
-      MissingExtraError: if it needs a package that is not installed.
-      ContractError: if an environment from elsewhere breaks the contract of `Env`.
+      UnknownNameError: there is no such task or value; the message names the nearest.
+      EnvOptionError: the task has no such option.
+      MissingExtraError: it needs a package that is not installed.
+      ContractError: an environment from elsewhere breaks the contract of `Env`.
     """
     task = _find(name)
     if backend not in BACKENDS:

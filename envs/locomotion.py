@@ -63,14 +63,9 @@ class Locomotion(Env):
         finite = jnp.all(jnp.isfinite(jnp.concatenate([after.qpos, after.qvel])))
         after = self._advance(before, jax.tree.map(lambda new, old: jnp.where(finite, new, old), after, before))
         reward, metrics = self._judge(before, after, action)
-        return state.replace(
-            physics=after,
-            obs=self._observe(after),
-            reward=reward,
-            terminated=~finite | ~self._is_healthy(after),
-            truncated=jnp.zeros((), bool),
-            metrics=metrics | {"unstable": (~finite).astype(jnp.float32)},
-        )
+        metrics |= {"unstable": (~finite).astype(jnp.float32)}
+        flags = {"terminated": ~finite | ~self._is_healthy(after), "truncated": jnp.zeros((), bool)}
+        return state.replace(physics=after, obs=self._observe(after), reward=reward, metrics=metrics, **flags)
 
     def render(self, physics: PhysicsState, *, height: int = 240, width: int = 320) -> np.ndarray:
         """Draw with MuJoCo's renderer, from the tracking camera."""

@@ -89,14 +89,9 @@ class Navigation(Env):
         physics = state.physics.replace(position=jnp.stack([x, y]))
         metrics = self._metrics(physics)
         success = metrics["success"] > 0
-        return state.replace(
-            physics=physics,
-            obs=self._observe(physics),
-            reward=jnp.where(success, jnp.float32(100.0), jnp.float32(-1.0)),
-            terminated=success,
-            truncated=jnp.zeros((), bool),
-            metrics=metrics,
-        )
+        reward = jnp.where(success, jnp.float32(100.0), jnp.float32(-1.0))
+        flags = {"terminated": success, "truncated": jnp.zeros((), bool)}
+        return state.replace(physics=physics, obs=self._observe(physics), reward=reward, metrics=metrics, **flags)
 
     def render(self, physics: NavigationState, *, height: int = 240, width: int = 320) -> np.ndarray:
         """Draw room, obstacles, start, goal, and the episode's path; a move too long for a tick is a reset."""
@@ -111,9 +106,7 @@ class Navigation(Env):
         axes.set(xticks=[], yticks=[], facecolor=_FLOOR)
         for spine in axes.spines.values():
             spine.set(color=_WALL, linewidth=2)
-        patches = [
-            Rectangle((x, y), x_high - x, y_high - y, color=_WALL) for x, y, x_high, y_high in np.asarray(self.walls)
-        ]
+        patches = [Rectangle((x, y), right - x, top - y, color=_WALL) for x, y, right, top in np.asarray(self.walls)]
         target = Circle((0, 0), GOAL_RADIUS, color=_GOAL, alpha=0.6, linewidth=0)
         for patch in (*patches, target):
             axes.add_patch(patch)

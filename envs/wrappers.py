@@ -14,7 +14,7 @@ from taic_jax.envs.views import Views
 
 
 class Wrapper(Env):
-    """An environment around another, with the inner one's attributes."""
+    """An environment around another, with the inner one's attributes and methods."""
 
     def __init__(self, env: Env):
         self.env = env
@@ -37,19 +37,15 @@ class Wrapper(Env):
         return wrapper
 
     def reset(self, key: Key[Array, ""]) -> State:
-        """Reset the inner environment."""
         return self.env.reset(key)
 
     def restart(self, key: Key[Array, ""], ended: Any) -> State:
-        """Restart the inner environment."""
         return self.env.restart(key, ended)
 
     def step(self, state: State, action: Float[Array, " A"]) -> State:
-        """Step the inner environment."""
         return self.env.step(state, action)
 
     def render(self, physics: Any, *, height: int = 240, width: int = 320) -> np.ndarray:
-        """Render with the inner environment."""
         return self.env.render(physics, height=height, width=width)
 
 

@@ -75,16 +75,14 @@ class ForeignEnv(Env):
     def _from_library(self, state: Any) -> State:
         parts = dict(state.obs) if self._in_parts else {"state": state.obs}
         obs = parts.pop("state")
-        return State(
-            physics=_strong(ForeignPhysics(getattr(state, self._simulation), state.info, parts)),
-            obs=jnp.asarray(obs, jnp.float32),
-            reward=jnp.asarray(state.reward, jnp.float32),
-            terminated=jnp.asarray(state.done, bool),
-            truncated=jnp.zeros((), bool),
-            metrics={name: jnp.asarray(value, jnp.float32) for name, value in state.metrics.items()},
-        )
+        physics = jax.tree.map(_strong, ForeignPhysics(getattr(state, self._simulation), state.info, parts))
+        obs, reward = jnp.asarray(obs, jnp.float32), jnp.asarray(state.reward, jnp.float32)
+        metrics = {name: jnp.asarray(value, jnp.float32) for name, value in state.metrics.items()}
+        flags = {"terminated": jnp.asarray(state.done, bool), "truncated": jnp.zeros((), bool)}
+        return State(physics, obs, reward, **flags, metrics=metrics)
 
 
-def _strong(tree: Any) -> Any:
-    """Make every dtype strong, so that reset and step return the same types."""
-    return jax.tree.map(lambda x: jax.lax.convert_element_type(jnp.asarray(x), jnp.asarray(x).dtype), tree)
+def _strong(leaf: Any) -> Array:
+    """Return an array of strong dtype, so that reset and step return the same types."""
+    array = jnp.asarray(leaf)
+    return jax.lax.convert_element_type(array, array.dtype)

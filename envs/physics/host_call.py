@@ -19,9 +19,7 @@ from jaxtyping import Array, Float
 
 HostFn = Callable[[np.ndarray, np.ndarray], None]
 """A function that reads its first argument and writes its second; both are float32 and XLA's own memory."""
-
-API_VERSION = (0, 1)
-"""Major and minor version of XLA's interface with the places below. 0.3 still has them; XLA serves both."""
+API_VERSION = (0, 1)  # Of XLA's interface with the places below: major and minor. 0.3 still has them; XLA serves both.
 
 # Places of words in XLA_FFI_CallFrame, XLA_FFI_Api, XLA_FFI_Extension_Base, XLA_FFI_Metadata and XLA_FFI_Buffer.
 _EXTENSION, _API, _ARGUMENTS, _RESULTS = 1, 2, 9, 14
@@ -29,9 +27,7 @@ _CREATE_ERROR = 6
 _EXTENSION_TYPE, _EXTENDED, _METADATA_VERSION = 1, 3, 3
 _DATA, _RANK, _DIMS = 3, 4, 5
 _METADATA, _INTERNAL = 1, 13  # codes of an extension and of an error
-
 _REFUSAL = "a negative number, or another shape"
-
 _Handler = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)
 
 

@@ -46,8 +46,6 @@ class MjxPhysics(Physics):
             self._data = mjx.make_data(model, impl=impl, **(_WARP_CAPACITY if warp else {}))
 
     def step(self, state: PhysicsState, ctrl: Float[Array, " nu"]) -> PhysicsState:
-        """Advance by one tick under constant controls."""
-
         def substep(state: PhysicsState, _: None) -> tuple[PhysicsState, None]:
             data = self._data.replace(qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.qacc_warmstart, ctrl=ctrl)
             data = mjx.step(self._model, data)

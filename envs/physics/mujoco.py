@@ -54,7 +54,6 @@ class MujocoPhysics(Physics):
         self.engine = _engine(saved.tobytes(), substeps, self.num_threads)
 
     def step(self, state: PhysicsState, ctrl: Float[Array, " nu"]) -> PhysicsState:
-        """Advance by one tick under constant controls."""
         nq, nv = self.model.nq, self.model.nv
         sent = jnp.concatenate([state.qpos, state.qvel, state.qacc_warmstart, ctrl])
         # `pure_callback` serves accelerators and an XLA that refuses our host calls. On CPU it takes ten times as long

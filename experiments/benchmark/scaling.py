@@ -75,15 +75,12 @@ class Widened(envs.Wrapper):
         self.observation_size = size
 
     def reset(self, key: Key[Array, ""]) -> envs.State:
-        """Reset, and widen the observation."""
         return self._widen(self.env.reset(key))
 
     def restart(self, key: Key[Array, ""], ended: Any) -> envs.State:
-        """Restart, and widen the observation."""
         return self._widen(self.env.restart(key, ended))
 
     def step(self, state: envs.State, action: Float[Array, " A"]) -> envs.State:
-        """Step, and widen the observation."""
         return self._widen(self.env.step(state, action))
 
     def _widen(self, state: envs.State) -> envs.State:
@@ -109,11 +106,10 @@ def scaling(env: envs.Env, config: PPOConfig, steps: int, rounds: int) -> Iterat
 
 def _at(env: envs.Env, config: PPOConfig, steps: int, axis: str, value: int) -> Training:
     """Return the training loop with one axis at a value, of flat training but for the option length."""
-    flat = IdentityExecutor(env.action_size)
-    if axis == "environments":
-        return Training(env, flat, replace(config, num_envs=value))
-    if axis == "seeds":
-        return Training(env, flat, config, value)
+    if axis == "option length":
+        options = loops.options_config("fixed", "open", steps, length=value)
+        return Training(env, loops.executor_of(env, options), config)
     if axis == "observation size":
-        return Training(Widened(env, max(value, env.observation_size)), flat, config)
-    return Training(env, loops.executor_of(env, loops.options_config("fixed", "open", steps, length=value)), config)
+        env = Widened(env, max(value, env.observation_size))
+    config = replace(config, num_envs=value) if axis == "environments" else config
+    return Training(env, IdentityExecutor(env.action_size), config, value if axis == "seeds" else 1)

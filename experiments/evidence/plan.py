@@ -81,7 +81,7 @@ class Cell(NamedTuple):
         return {(self.config.env.name, method, self.config.seed) for method in self.stages}
 
 
-def changed(config: Config, fields: Mapping[str, Any]) -> Config:
+def replace_all(config: Config, fields: Mapping[str, Any]) -> Config:
     """Replace the fields, or groups of fields, of these dotted names."""
     for name, value in fields.items():
         config = replace(config, name, value)
@@ -96,7 +96,7 @@ def flat_config(task: str, strength: str, seed: int, seeds: int) -> Config:
     fields["train.ppo.gamma"] = config.collect.ppo.gamma  # the preset's own may be for fine-tuning
     if strength == "weak":
         fields["collect.ppo"] = load_config("paper").collect.ppo
-    return changed(config, fields)
+    return replace_all(config, fields)
 
 
 def name_of(task: str, method: str, seed: int) -> str:
@@ -108,7 +108,7 @@ def with_options(config: Config, task: str, decoder: str) -> Config:
     """Return the config with options of a robot: its preset's in closed loop, HalfCheetah's in open loop."""
     preset = load_config(task if decoder == "closed" else "half_cheetah_open")
     config = replace(config, "options", preset.options)
-    return config if decoder == "closed" else changed(config, OPEN.get(task, {}))
+    return config if decoder == "closed" else replace_all(config, OPEN.get(task, {}))
 
 
 def options_config(task: str, method: str, run_dir: Path, seed: int, seeds: int) -> Config:
@@ -126,7 +126,7 @@ def options_config(task: str, method: str, run_dir: Path, seed: int, seeds: int)
     if tuned:  # as the preset does it
         train = load_config(task).train
         fields |= {"train.ppo": train.ppo, "train.fine_tune": train.fine_tune}
-    return changed(config, fields)
+    return replace_all(config, fields)
 
 
 def robots(task: str, run_dir: Path, chunk: int = 10) -> list[Cell]:
@@ -154,13 +154,13 @@ def transfers(task: str, run_dir: Path, seeds: int = 10) -> list[Cell]:
     ant, preset = load_config("ant"), load_config(f"transfer_{task}")
     runs = {name: str(run_dir / name) for name in ("ant/source", "ant/source-open", "ant/source-steering")}
     source = one_iteration(replace(ant, "collect.ticks", TICKS["ant"]), seeds)
-    learnt = {"options.experience": (runs["ant/source"],)}
-    opened = with_options(source, "ant", "open").options
+    from_source = {"options.experience": (runs["ant/source"],)}
+    open_loop = with_options(source, "ant", "open").options
     steering = load_config("ant_steering").options
     sources = [Cell("ant/source", source, {}, "8")]
-    for name, options in (("ant/source-open", opened), ("ant/source-steering", steering)):
-        sources.append(Cell(name, changed(source, {"options": options} | learnt), {}, "8"))
-    config = changed(preset, PLAIN | SCORED | {"seed": FIRST_SEED, "seeds": seeds})
+    for name, options in (("ant/source-open", open_loop), ("ant/source-steering", steering)):
+        sources.append(Cell(name, replace_all(source, {"options": options} | from_source), {}, "8"))
+    config = replace_all(preset, PLAIN | SCORED | {"seed": FIRST_SEED, "seeds": seeds})
     closed = {"options.source": runs["ant/source-steering"]}
     flat = {"train.ppo": ant.train.ppo}  # no policy over options is trained
     policy = {"options": ant.options, "options.source": runs["ant/source"]}
@@ -168,11 +168,11 @@ def transfers(task: str, run_dir: Path, seeds: int = 10) -> list[Cell]:
         "tuned": closed | {"train.fine_tune": preset.train.fine_tune},
         "flat": flat | {"train.baselines": ("flat",), "options": OptionsConfig()},
         "transfer": flat | {"train.baselines": ("transfer",)} | policy,
-        "open": {"options": opened, "options.source": runs["ant/source-open"]},
+        "open": {"options": open_loop, "options.source": runs["ant/source-open"]},
         "closed": closed,
     }
     return sources + [
-        Cell(f"{task}/{name}", changed(config, fields), {name: TRANSFERRED[name][1]}, "8")
+        Cell(f"{task}/{name}", replace_all(config, fields), {name: TRANSFERRED[name][1]}, "8")
         for name, fields in methods.items()
     ]
 
@@ -180,14 +180,14 @@ def transfers(task: str, run_dir: Path, seeds: int = 10) -> list[Cell]:
 def one_iteration(config: Config, seeds: int) -> Config:
     """Return the config of a source run, whose policy over options is not used: it trains for one iteration."""
     ticks = config.train.ppo.num_envs * config.train.ppo.rollout_length
-    return changed(config, PLAIN | {"train.ticks": ticks, "seed": FIRST_SEED, "seeds": seeds})
+    return replace_all(config, PLAIN | {"train.ticks": ticks, "seed": FIRST_SEED, "seeds": seeds})
 
 
 def recovery(run_dir: Path, seeds: int = 50) -> list[Cell]:
     """Return the runs of figure 5: options of the room, and recovery after it changes."""
     source = one_iteration(load_config("nav2d"), seeds)
     fields = {"options.experience": (str(run_dir / "nav2d/source"),), "seed": FIRST_SEED, "seeds": seeds}
-    change = changed(load_config("nav2d_change"), fields)
+    change = replace_all(load_config("nav2d_change"), fields)
     stages = {method: stage for method, (_, stage) in RECOVERING.items()}
     return [Cell("nav2d/source", source, {PATHS: "options"}, "5"), Cell("nav2d/change", change, stages, "5")]
 

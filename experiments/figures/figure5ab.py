@@ -28,7 +28,6 @@ class Figure5ab(Figure):
     number = "5ab"
 
     def draw(self, rows: Rows) -> tuple[Picture, Rows]:
-        """Return the picture and its numbers."""
         runs = select(rows, RECOVERY, PATHS, MODELS)
         example = next(row["example"] for row in rows if (row["task"], row["method"]) == (RECOVERY, PATHS))
         numbers, remarks = [], {"remarks": "; ".join(runs.remarks)}

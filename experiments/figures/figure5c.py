@@ -33,7 +33,6 @@ class Figure5c(Figure):
     )  # fmt: skip
 
     def draw(self, rows: Rows) -> tuple[Picture, Rows]:
-        """Return the picture and its numbers."""
         methods = {method: select(rows, RECOVERY, method, SEEDS) for method in RECOVERING}
         lines = [numbers(runs) for runs in methods.values()]
         counts = [(line["recovered"], line["seeds"] - line["recovered"]) for line in lines]

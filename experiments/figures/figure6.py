@@ -40,7 +40,6 @@ class Figure6(Figure):
     task: str = "half_cheetah"  # The robot.
 
     def draw(self, rows: Rows) -> tuple[Picture, Rows]:
-        """Return the picture and its numbers."""
         rows = [row for row in rows if row["task"] == self.task]
         present = {row["method"] for row in rows}
         methods = {name: select(rows, self.task, name, MODELS) for name in METHODS | OTHERS if name in present}

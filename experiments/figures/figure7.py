@@ -36,7 +36,6 @@ class Figure7(Figure):
     methods: tuple[str, ...] = tuple(METHODS)  # Curves.
 
     def draw(self, rows: Rows) -> tuple[Picture, Rows]:
-        """Return the picture and its numbers."""
         if unknown := set(self.methods) - set(METHODS):
             raise TableError(f"--methods: expected some of {', '.join(METHODS)}, got {min(unknown)}")
         panels = read_panels(self, rows, self.tasks, {name: METHODS[name] for name in self.methods})
@@ -54,7 +53,7 @@ def numbers(runs: EvidenceRows, methods: dict[str, EvidenceRows]) -> Rows:
     if BASELINE not in methods:
         return [row]
     flat = methods[BASELINE]
-    above = curve >= iqm(flat.numbers["last"]) / 2
+    above = curve >= iqm(flat.numbers["last"]) / 2  # the threshold
     first = np.where(above.any(axis=1), runs.grid[above.argmax(axis=1)], np.inf)
     row |= {"ticks_to_threshold": float(np.median(first)), "reached": f"{above.any(axis=1).sum()}/{len(last)}"}
     if runs.method != BASELINE:

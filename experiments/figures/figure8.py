@@ -45,7 +45,6 @@ class Figure8(Figure):
     tasks: tuple[str, ...] = TRANSFERS  # Panels.
 
     def draw(self, rows: Rows) -> tuple[Picture, Rows]:
-        """Return the picture and its numbers."""
         methods = {name: (label, SEEDS) for name, (label, _) in TRANSFERRED.items()}
         panels = read_panels(self, rows, self.tasks, methods)
         return picture(panels), numbers_of(panels, numbers)
