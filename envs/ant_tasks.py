@@ -82,8 +82,6 @@ class AntArena(Locomotion):
     @property
     def evaluated(self) -> "AntArena":
         """This arena with its fixed goal."""
-        if not self.uniform_goal:
-            return self
         arena = copy.copy(self)
         arena.uniform_goal = False
         return arena

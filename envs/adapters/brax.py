@@ -14,15 +14,11 @@ BRAX_PIPELINES = ("spring", "positional", "generalized", "mjx")
 
 
 class BraxEnv(ForeignEnv):
-    """Any environment registered with Brax; its `done` is our `terminated`, and the time limit is ours.
-
-    Args:
-      name: as registered with Brax, without prefix.
-      pipeline: Brax's physics.
+    """The environment registered with Brax under a name, without prefix, on one of Brax's pipelines.
 
     Raises:
-      UnknownNameError: if there is no such environment or pipeline.
-      AdapterError: if Brax refuses the pipeline, the observation is not one vector, or actions have no limits.
+      UnknownNameError: there is no such environment or pipeline.
+      AdapterError: Brax refuses the pipeline, the observation is not one vector, or actions have no limits.
     """
 
     episode_length = 1000  # ticks

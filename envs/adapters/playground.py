@@ -19,19 +19,16 @@ PLAYGROUND_PREFIX = "playground:"
 
 
 class PlaygroundEnv(ForeignEnv):
-    """An environment of MuJoCo Playground; its `done` is our `terminated`, and the time limit is ours.
+    """The environment registered with MuJoCo Playground under a name, without prefix.
 
-    Of an observation in parts, the one named "state" is taken. Physics is MJX's in JAX, also where Playground
-    would choose Warp, and an action is applied for one step, at any `action_repeat`.
-
-    Args:
-      name: as registered with Playground, without prefix.
+    Physics is MJX's in JAX, also where Playground would choose Warp, and an action is applied for one step, at any
+    `action_repeat`.
 
     Raises:
       MissingExtraError: Playground is not installed.
-      UnknownNameError: if there is no such environment.
-      AdapterError: if it needs models that are not on this machine, which are never downloaded, its observation
-        is not one vector, or actions have no limits.
+      UnknownNameError: there is no such environment.
+      AdapterError: it needs models that are not on this machine, which are never downloaded, its observation is not one
+        vector, or actions have no limits.
     """
 
     def __init__(self, name: str):

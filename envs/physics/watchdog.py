@@ -20,7 +20,7 @@ class Watchdog:
     def __enter__(self) -> None:
         self._since[threading.get_ident()] = time.monotonic()
         if self._thread is None:
-            self._thread = threading.Thread(target=_look_on, args=(weakref.ref(self), self.limit / 4), daemon=True)
+            self._thread = threading.Thread(target=_watch, args=(weakref.ref(self), self.limit / 4), daemon=True)
             self._thread.start()
 
     def __exit__(self, *_: object) -> None:
@@ -36,12 +36,12 @@ class Watchdog:
         return since
 
 
-def _look_on(watchdog: "weakref.ref[Watchdog]", interval: float) -> None:
+def _watch(watchdog: "weakref.ref[Watchdog]", interval: float) -> None:
     reported = None
     while True:
         time.sleep(interval)
-        watched = watchdog()
-        if watched is None:
+        alive = watchdog()
+        if alive is None:
             return
-        reported = watched.late(reported)
-        del watched  # or it would never be collected
+        reported = alive.late(reported)
+        del alive  # or it would never be collected

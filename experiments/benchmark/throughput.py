@@ -67,7 +67,7 @@ def our_loops(arguments: Arguments, env: envs.Env) -> dict[str, Ticking]:
     """Return the loops of the engine, the rollout, and training: flat, over options, and of several seeds."""
     rollout = loops.untrained_rollout(env, arguments.num_envs, arguments.rollout_length)
     engine = {"engine": loops.bare_engine(env, rollout.run()[1].action)} if loops.has_engine(env) else {}
-    ours: dict[str, Ticking] = engine | {"rollout": rollout}
+    ours: dict[str, Ticking] = {**engine, "rollout": rollout}
     options: dict[str, OptionsConfig | None] = {"flat_training": None}
     for decoder, rule in itertools.product(arguments.decoders, arguments.rules):
         name = HEADLINE if (rule, decoder) == PAPER else f"{HEADLINE}/{rule}/{decoder}"

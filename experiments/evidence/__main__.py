@@ -61,11 +61,11 @@ def plan(cells: Sequence[Cell], only: tuple[str, ...], present: Set[Key], run_di
 def do(cell: Cell, run_dir: Path, shard: Shard = "none") -> None:
     """Begin, resume or check a run, with its seeds split over devices by `shard`."""
     folder = run_dir / cell.name
-    run, stages = RunFolder(folder), set(cell.stages.values())
+    run = RunFolder(folder)
     if run.finished:
         run.prepare(cell.config, resume=True)  # only checks that it is this run
-    elif len(cell.stages) == 1 and not stages & {"train", "options"}:
-        run_flat(cell, folder, *stages, make_devices(shard, cell.config), run.begun)
+    elif len(cell.stages) == 1 and not set(cell.stages.values()) & {"train", "options"}:
+        run_flat(cell, folder, make_devices(shard, cell.config), run.begun)
     else:
         run_pipeline(cell.config, folder, resume=run.begun, shard=shard)
 
@@ -83,9 +83,9 @@ def make_row(cell: Cell, run_dir: Path, method: str, stage: str) -> dict[str, An
     return row
 
 
-def run_flat(cell: Cell, folder: Path, stage: str, devices: Devices, resume: bool) -> None:
+def run_flat(cell: Cell, folder: Path, devices: Devices, resume: bool) -> None:
     """Train flat PPO alone: `collect`, which saves its experience, or a baseline."""
-    config = cell.config
+    config, (stage,) = cell.config, cell.stages.values()
     env, source = make_envs(config)
     _, policy = take_over(config, env, source)
     with Run.open(config, folder, resume=resume, devices=devices) as run:
@@ -98,18 +98,17 @@ def show(cells: Sequence[Cell], rows: dict[Key, dict[str, Any]], arguments: Argu
     for cell in cells:
         if arguments.only and not cell.name.startswith(arguments.only):
             continue
-        folder = arguments.run_dir / cell.name
-        if RunFolder(folder).finished:
+        folder, own = arguments.run_dir / cell.name, [rows[key] for key in cell.keys & rows.keys()]
+        if cell.stages and len(own) == len(cell.keys):
+            state = f"in the table, took {max(row['seconds'] for row in own) / 60:.0f} minutes"
+            if {row["config"] for row in own} != {config_hash(cell.config, arguments.run_dir)}:
+                state += ", is of another config: cut its rows to do it again"
+        elif RunFolder(folder).finished:
             state = "finished, to be taken in" if cell.stages else "finished"
         elif folder.exists():
             state = "begun"
         else:
             state = "missing" if cell.stages else "made when another run needs it"
-        if cell.stages and cell.keys <= rows.keys():
-            own = [rows[key] for key in cell.keys]
-            state = f"in the table, took {max(row['seconds'] for row in own) / 60:.0f} minutes"
-            if {row["config"] for row in own} != {config_hash(cell.config, arguments.run_dir)}:
-                state += ", is of another config: cut its rows to do it again"
         ticks = cell.config.train.ticks if "collect" not in cell.stages.values() else cell.config.collect.ticks
         print(f"figure {cell.figure}  {cell.name:36} {cell.config.seeds:3} seeds x {ticks:9,} ticks  {state}")
 

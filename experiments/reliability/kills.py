@@ -109,7 +109,7 @@ def kill_one(folder: Path, kind: str, source: str, seconds: float) -> str:
     rows = run.metrics() if run.metrics_path.is_file() else []
     stage = "end" if run.finished else rows[-1]["stage"] if rows else "start"
     execute(folder, kind, "--resume" if run.begun else source)
-    return "sweep" if kind == "sweep" else stage
+    return kind if kind == "sweep" else stage
 
 
 def kill_all(arguments: Arguments, root: Path) -> Iterator[tuple[str, float, list[str]]]:
