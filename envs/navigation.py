@@ -142,7 +142,7 @@ class Navigation(Env):
         return metrics
 
     def _standing(self, episode: Int[Array | np.ndarray, "*T 1"]) -> Bool[Array | np.ndarray, "*T R"]:
-        """Return which walls stand in which episode."""
+        """Return for each episode the walls that stand."""
         return self._since <= episode
 
     def _free_point(self, uniform: Float[Array, " 3"]) -> Float[Array, " 2"]:
@@ -160,7 +160,7 @@ def inside(
 
 @jax.jit
 def free_cells(walls: Float[Array, "R 4"]) -> tuple[Float[Array, "M 2"], Array]:
-    """Raster the room; return the cells' lower corners, those of free cells first, and how many are free."""
+    """Raster the room; return the cells' lower corners, those of free cells first, and the number of free ones."""
     axis = CELL * jnp.arange(round(ROOM / CELL), dtype=jnp.float32)
     corners = jnp.stack(jnp.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
     low, high = walls[None, :, :2], walls[None, :, 2:]

@@ -86,7 +86,7 @@ class AutoReset(Wrapper):
         return state.replace(key=key, final_obs=state.obs)
 
     def step(self, state: State, action: Float[Array, " A"]) -> State:
-        """Step, then reset where the episode ended."""
+        """Step, and start the next episode if this one ends."""
         key, key_reset = jax.random.split(state.key)
         state = self.env.step(state, action)
         running = (state.physics, state.obs, state.tick)
@@ -100,7 +100,7 @@ class AutoReset(Wrapper):
         return restart(*args)
 
     def _restart_ended(self, ended: Array, key: Array, running: Any) -> Any:
-        """Put a fresh start where an episode ended; all arguments have the leading axes of `ended`."""
+        """Replace each state at an episode's end by a fresh start; all arguments have the leading axes of `ended`."""
 
         def restart(ended: Array, key: Array, running: Any) -> Any:
             start = self.env.restart(key, running[0])

@@ -55,7 +55,7 @@ def to_gymnasium_vector(env: Env, num_envs: int, render_mode: str | None = None)
 
     An episode that ends is followed by the next in the same tick (`AutoresetMode.SAME_STEP`): obs is the next
     episode's first, and infos hold the last one's `final_obs` and, as `final_info`, its metrics. Errors are those of
-    `to_gymnasium`, and `AdapterError` where N is not a positive integer.
+    `to_gymnasium`, and `AdapterError` if N is not a positive integer.
     """
     with extra("gym"):
         from taic_jax.envs.adapters.gymnasium_export import GymnasiumVectorExport

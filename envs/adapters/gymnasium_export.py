@@ -149,6 +149,6 @@ def _floats(metrics: dict[str, Any]) -> dict[str, float]:
 
 
 def _masked(metrics: dict[str, np.ndarray], mask: np.ndarray) -> dict[str, np.ndarray]:
-    """Return each metric [N], 0 where the mask is not set, and, as Gymnasium does, the mask beside it."""
+    """Return each metric [N], 0 outside the mask, and the mask under its name with an underscore, as Gymnasium does."""
     values = {name: np.where(mask, values, np.zeros_like(values)) for name, values in metrics.items()}
     return values | {f"_{name}": mask.copy() for name in metrics}

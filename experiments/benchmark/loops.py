@@ -106,8 +106,7 @@ class Training:
         arrays, keys = as_arrays(config), jax.random.split(jax.random.key(0), seeds)
         init = partial(ppo.init, arrays, env, executor)
         iterate = partial(ppo.iterate, arrays, env, executor, ITERATIONS)
-        state = jax.jit(jax.vmap(init) if seeds > 1 else init)(keys if seeds > 1 else keys[0])
-        self.state = devices.place(state)
+        self.state = devices.place(jax.jit(jax.vmap(init))(keys) if seeds > 1 else jax.jit(init)(keys[0]))
         step = jax.vmap(lambda state: iterate(state)[:2]) if seeds > 1 else lambda state: iterate(state)[:2]
         self._step = devices.compile(step, self.state, donate=True)
 
@@ -129,12 +128,10 @@ def untrained_ticks(env: envs.Env) -> Rollout:
 
 
 def executor_of(env: envs.Env, config: OptionsConfig | None, ticks: Rollout | None = None) -> Executor:
-    """Return options learnt from ticks of an untrained policy, or actions themselves where there is no config.
+    """Return options learnt from ticks of an untrained policy, or actions themselves without a config.
 
-    The options' quality changes no speed, only their duration does.
-
-    Raises:
-      ShortExperienceError: delta is a quantile, and the ticks are too few for a held-out part.
+    The options' duration changes the speed, their quality does not. Raise `ShortExperienceError` if delta is a
+    quantile, and the ticks are too few for a held-out part.
     """
     if config is None:
         return IdentityExecutor(env.action_size)

@@ -175,7 +175,7 @@ def recovery_of(rows: Sequence[Row], stage: str) -> tuple[np.ndarray, dict[str, 
 
 
 def has_recovered(numbers: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return which seeds recovered [K]; one has not whose room never changed, or too late."""
+    """Return which seeds recovered [K]; a seed whose room changes too late or never has not."""
     return np.nan_to_num(numbers["success_after"]) >= RECOVERED
 
 

@@ -38,7 +38,7 @@ PLAIN: dict[str, Any] = {"train.baselines": (), "train.fine_tune": FineTuneConfi
 SCORED = {"evaluate.episodes": 20, "evaluate.video_ticks": 0}
 
 # Method: label and fewest seeds of figure 7. An option method's name is its termination, decoder and constraints, and
-# `tuned` where PPO changes D too.
+# `tuned` if PPO changes D too.
 METHODS = {
     "strong": ("flat PPO", 20),
     "long": ("flat PPO, twice as long", 10),
@@ -51,12 +51,12 @@ METHODS = {
     "fixed-closed-both": ("Fix-len, closed loop", 10),
     "fixed-closed-both-tuned": ("Fix-len, closed loop, fine-tuned", 20),
 }
-# Of these figure 6 draws an example: the method's name in the paper.
+# The examples of figure 6: the method's name in the paper.
 SPACES = {"fixed-open-none": "RVAE", "output-open-both": "Term-output", "predict-open-both": "Term-predict"}
 BASELINE = "strong"
 FLAT = {"strong": "collect", "weak": "collect", "long": "collect", "repeat": "repeat"}
 """Methods without options, and the stage that trains each."""
-# Beside them, for the table of options: every rule in closed loop, and what the constraints do there.
+# Beside them, for the table of options: every rule in closed loop, and one without constraints.
 OTHERS = dict.fromkeys(("output-closed-both", "predict-closed-both", "fixed-closed-none"), ("", 10))
 # Of figure 8: the method's name, and of figure 5c: the stage of the run that trains it.
 TRANSFERRED = {"open": ("options of Ant, open loop", "train"), "closed": ("options of Ant, closed loop", "train"),
@@ -123,7 +123,7 @@ def options_config(task: str, method: str, run_dir: Path, seed: int, seeds: int)
         fields["options.length"] = 10
     if rule == "predict":
         fields |= SURPRISE[decoder]
-    if tuned:  # as the preset does it
+    if tuned:
         train = load_config(task).train
         fields |= {"train.ppo": train.ppo, "train.fine_tune": train.fine_tune}
     return replace_all(config, fields)

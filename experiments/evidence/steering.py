@@ -44,7 +44,7 @@ class Arguments:
     """Measure whether the options of runs steer."""
 
     runs: tyro.conf.Positional[tuple[Path, ...]]
-    """Folders of finished runs whose options are of the ant."""
+    """Folders of finished runs with options of the ant."""
     out: Path = RESULTS / "steering.csv"  # The table of numbers.
 
 
@@ -52,11 +52,10 @@ class Unending(Wrapper):
     """A task that continues after a fall, as the arenas do."""
 
     def step(self, state: State, action: Float[Array, " A"]) -> State:
-        """Take one tick."""
         return self.env.step(state, action).replace(terminated=jnp.zeros((), bool))
 
 
-def hold(
+def follow(
     env: Env, executor: Executor, begin: RolloutCarry, codes: Float[Array, "N D"], key: Key[Array, ""]
 ) -> tuple[RolloutCarry, Float[Array, "N 2"]]:
     """Choose one code in each environment, again whenever its option ends; return the end and the way to it in m."""
@@ -70,11 +69,10 @@ def walk(env: Env, executor: Executor, key: Key[Array, ""]) -> dict[str, Array]:
     code; `over` [CODES, STARTS] marks the ants on their backs after the change."""
     key_codes, key_start, key_before, key_after = jax.random.split(key, 4)
     env = AutoReset(Unending(env))
-    drawn = jax.random.normal(key_codes, (2, CODES, executor.option_size))
-    codes, others = jnp.repeat(drawn, STARTS, axis=1)
-    after, before = hold(env, executor, start(env, executor, len(codes), key_start), codes, key_before)
-    _, same = hold(env, executor, after, codes, key_after)
-    last, changed = hold(env, executor, after, others, key_after)
+    codes, others = jnp.repeat(jax.random.normal(key_codes, (2, CODES, executor.option_size)), STARTS, axis=1)
+    after, before = follow(env, executor, start(env, executor, len(codes), key_start), codes, key_before)
+    _, same = follow(env, executor, after, codes, key_after)
+    last, changed = follow(env, executor, after, others, key_after)
     over = jax.vmap(upside_down)(last.env.physics.qpos[:, 3:7])
     ways = {"before": before, "same": same, "changed": changed, "over": over}
     return jax.tree.map(lambda x: x.reshape(CODES, STARTS, *x.shape[1:]), ways)
@@ -107,12 +105,8 @@ def measure(ways: dict[str, np.ndarray]) -> dict[str, float]:
 
 
 def steering_of(folder: Path) -> tuple[int, dict[str, np.ndarray]]:
-    """Return the most ticks of an option of a run, and the measures of every seed's model [K].
-
-    Raises:
-      ConfigError: its robot cannot go in every direction.
-      ArtifactError: there are no options.
-    """
+    """Return the most ticks of an option of a run, and the measures of every seed's model [K]; raise `ConfigError` if
+    its robot cannot go in every direction, and `ArtifactError` if there are no options."""
     config = RunFolder(folder).config()
     _, env = make_envs(config)
     robot: Any = getattr(env, "model", None)
@@ -120,11 +114,11 @@ def steering_of(folder: Path) -> tuple[int, dict[str, np.ndarray]]:
         expected = "options of a robot that walks in every direction, as ant"
         raise ConfigError(f"{folder}: expected {expected}, got {env.name}")
     models = load_options(folder, env, config.options, config.seeds)
-    walked = jax.jit(partial(walk, env))  # one program for all seeds
+    run = jax.jit(partial(walk, env))  # one program for all seeds
     rows = []
     for seed in range(config.seeds):
         executor = make_executor(as_arrays(config.options), jax.tree.map(lambda x, k=seed: x[k], models))
-        rows.append(measure(jax.device_get(walked(executor, jax.random.key(config.seed + seed)))))
+        rows.append(measure(jax.device_get(run(executor, jax.random.key(config.seed + seed)))))
     return config.options.length, {name: np.array([row[name] for row in rows]) for name in rows[0]}
 
 

@@ -22,7 +22,7 @@ from taic_jax.runtime.run_folder import Row, RunFolder
 RESULTS = Path("experiments/results")
 TABLE = RESULTS / "evidence.jsonl"
 GRID = 50  # Points of a curve, equally far apart; the last is the end of training.
-EARLIER_DEFAULTS = {"collect.capacity": 1_000_000}  # Of fields whose default has changed since the first row.
+EARLIER_DEFAULTS = {"collect.capacity": 1_000_000}  # Fields with another default today.
 OWN = ("seed", "seeds")  # Fields of the seeds alone.
 
 

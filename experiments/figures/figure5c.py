@@ -1,6 +1,6 @@
 """Figure 5c: recovery from a sudden change of the room, and the numbers of claim C4.
 
-A seed has recovered where at least 90 % of the last 100 training episodes within 200 000 ticks after the change reach
+A seed has recovered if at least 90 % of the last 100 training episodes within 200 000 ticks after the change reach
 the goal; see `evidence.measures.recovery_of`.
 """
 

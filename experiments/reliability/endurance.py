@@ -36,7 +36,7 @@ class Sample(NamedTuple):
 
 @dataclass(frozen=True)
 class Arguments:
-    """Watch a run, whose config and options follow, --run-dir among them; exit code 1 if it failed."""
+    """Watch a run with the config and options that follow, --run-dir among them; exit code 1 if it fails."""
 
     hours: float = 2.0  # After which it is stopped.
 

@@ -87,13 +87,10 @@ def outcome(folder: Path) -> dict[str, Any]:
 
 def _arrays(folder: Path) -> Iterator[tuple[str, bytes]]:
     for path in folder.rglob("*"):
+        arrays = load_arrays(path) if (path / "_CHECKPOINT_METADATA").is_file() else {}
         if path.suffix == ".npz":
             with np.load(path) as file:
                 arrays = dict(file)
-        elif (path / "_CHECKPOINT_METADATA").is_file():
-            arrays = load_arrays(path)
-        else:
-            continue
         yield from ((f"{path.relative_to(folder)}/{name}", array.tobytes()) for name, array in arrays.items())
 
 
@@ -109,7 +106,7 @@ def kill_one(folder: Path, kind: str, source: str, seconds: float) -> str:
     rows = run.metrics() if run.metrics_path.is_file() else []
     stage = "end" if run.finished else rows[-1]["stage"] if rows else "start"
     execute(folder, kind, "--resume" if run.begun else source)
-    return kind if kind == "sweep" else stage
+    return "sweep" if kind == "sweep" else stage
 
 
 def kill_all(arguments: Arguments, root: Path) -> Iterator[tuple[str, float, list[str]]]:
