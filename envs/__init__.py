@@ -11,8 +11,8 @@ from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
-# MuJoCo chooses how to draw when it is first imported. Its own choice needs a display. EGL does not, but
-# where that library is missing, to ask for it would make the import fail.
+# MuJoCo chooses its way to draw at its first import. Its own choice needs a display. EGL does not, but without that
+# library the import would fail.
 if sys.platform == "linux" and "DISPLAY" not in os.environ and ctypes.util.find_library("EGL"):
     os.environ.setdefault("MUJOCO_GL", "egl")
 
@@ -37,7 +37,7 @@ __all__ = [
 
 
 class _Task(NamedTuple):
-    """A task's constructor; its arguments are these options, and `backend` and `num_threads` for an engine."""
+    """A task's constructor, and its arguments: these options, and `backend` and `num_threads` for an engine."""
 
     make: Callable[..., Env]
     options: tuple[str, ...] = ()
@@ -63,30 +63,20 @@ _TASKS = {
 
 
 def environment_names() -> tuple[str, ...]:
-    """List the tasks of this package; `make_env` also knows others' by prefix and the user's own by file or module."""
+    """List the tasks of this package; `make_env` also makes others' by prefix and the user's own by file or module."""
     return tuple(_TASKS)
 
 
 def environment_options(name: str) -> tuple[str, ...]:
-    """List the options of `make_env` that a task takes, besides backend and number of threads.
-
-    Raises:
-      UnknownNameError: if there is no such task; the message names the nearest.
-    """
+    """List the options of `make_env` for a task, besides backend and number of threads; raise `UnknownNameError` if
+    there is no such task."""
     return _find(name).options
 
 
 def make_env(
-    name: str,
-    backend: str = "auto",
-    *,
-    num_threads: int = 0,
-    pipeline: str = "spring",
-    model: str = "brax",
-    body: str = "gym",
-    goal: str = "fixed",
-    change_after: int = 0,
-) -> Env:
+    name: str, backend: str = "auto", *, num_threads: int = 0, pipeline: str = "spring", model: str = "brax",
+    body: str = "gym", goal: str = "fixed", change_after: int = 0,
+) -> Env:  # fmt: skip
     """Make a task by name, with its time limit.
 
     Args:
@@ -101,10 +91,10 @@ def make_env(
       change_after: episodes after which the room of `nav2d` changes; 0 for never.
 
     Raises:
-      UnknownNameError: if there is no such task or value; the message names the nearest.
-      EnvOptionError: if the task has no such option.
-      MissingExtraError: if it needs a package that is not installed.
-      ContractError: if an environment from elsewhere breaks the contract of `Env`.
+      UnknownNameError: there is no such task or value; the message names the nearest.
+      EnvOptionError: the task has no such option.
+      MissingExtraError: it needs a package that is not installed.
+      ContractError: an environment from elsewhere breaks the contract of `Env`.
     """
     task = _find(name)
     if backend not in BACKENDS:

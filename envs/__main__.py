@@ -30,7 +30,7 @@ PROGRAM = "python -m taic_jax.envs"
 HEIGHT, WIDTH = 300, 400  # pixels of every picture
 GAP, CAPTION = 20, 36  # pixels between the tiles of the sheet, and below each for its name
 INK, PAPER, FRAME = "#3d4451", "#ffffff", "#c9ccd2"
-MEMORY = 10  # ticks in which the random actions lose most of their past: shorter ones make a body only shiver
+MEMORY = 10  # ticks of correlation of the random actions; with fewer a body only shivers
 SPREAD = 0.8  # their standard deviation, before they are clipped
 
 
@@ -44,8 +44,7 @@ class Arguments:
     """Tasks to draw, by any name that make_env takes; none means all of this package."""
     contact_sheet: Annotated[Path | None, tyro.conf.arg(metavar="FILE.png")] = None
     """Also write one picture that shows all tasks with their names."""
-    ticks: int = 100
-    """Length of the animations."""
+    ticks: int = 100  # Length of the animations.
 
 
 class ArgumentError(ValueError):
@@ -53,7 +52,7 @@ class ArgumentError(ValueError):
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Draw, and return the exit code: 0, or 2 where the arguments or this machine do not allow it."""
+    """Draw, and return the exit code: 0, or 2 for a mistake of the user or a machine that cannot draw."""
     try:
         draw(parse(sys.argv[1:] if args is None else args))
     except BrokenPipeError:  # the reader, such as head, has stopped
@@ -68,7 +67,7 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 def parse(args: Sequence[str]) -> Arguments:
-    """Parse the arguments; `ArgumentError` where one is not valid."""
+    """Parse the arguments; raise `ArgumentError` if one is not valid."""
     try:
         with contextlib.redirect_stderr(io.StringIO()):
             arguments = tyro.cli(Arguments, prog=PROGRAM, args=args)
@@ -76,12 +75,13 @@ def parse(args: Sequence[str]) -> Arguments:
         if not stop.code:
             raise
         names = ["--" + field.name.replace("_", "-") for field in dataclasses.fields(Arguments)]
+        valid = ", ".join(names)
         for option in (arg.partition("=")[0] for arg in args if arg.startswith("--")):
             if option.replace("_", "-") not in names:
                 similar = nearest(option, names, cutoff=0.6)
-                hint = f"the nearest is {similar}" if similar else f"there are {', '.join(names)}"
+                hint = f"the nearest is {similar}" if similar else f"there are {valid}"
                 raise ArgumentError(f"unknown option {option}; {hint}") from None
-        raise ArgumentError(f"expected {', '.join(names)} with their values, got {' '.join(args)!r}") from None
+        raise ArgumentError(f"expected {valid} with their values, got {' '.join(args)!r}") from None
     if arguments.ticks < 1:
         raise ArgumentError(f"--ticks: expected at least 1, got {arguments.ticks}; the nearest valid value is 1")
     sheet = arguments.contact_sheet
@@ -91,12 +91,12 @@ def parse(args: Sequence[str]) -> Arguments:
 
 
 def draw(arguments: Arguments) -> None:
-    """Write the pictures, and print the path of each; a mistake in a name raises before any is written."""
+    """Write the pictures, and print the path of each; raise at a wrong name before any is written."""
     envs = [make_env(name) for name in arguments.tasks or environment_names()]
     arguments.out.mkdir(parents=True, exist_ok=True)
     tiles = {}
     for env in envs:
-        key = jax.random.key(zlib.crc32(env.name.encode()) >> 1)  # its own, but the same whatever else is drawn
+        key = jax.random.key(zlib.crc32(env.name.encode()) >> 1)  # of the name alone, not of the other tasks
         states = jax.device_get(random_episodes(env, key, arguments.ticks))
         frames = env.render(states.physics, height=HEIGHT, width=WIDTH)
         path = arguments.out / re.sub(r"[^\w-]+", "_", env.name)
@@ -112,7 +112,7 @@ def draw(arguments: Arguments) -> None:
 
 
 def random_episodes(env: Env, key: Key[Array, ""], ticks: int) -> State:
-    """Act at random but smoothly, with automatic resets; return the states after each tick, leading axis T.
+    """Act at random with automatic resets; return the states after each tick, leading axis T.
 
     The actions are white noise through a first-order filter: a slow body would average white noise away.
     """
@@ -135,14 +135,14 @@ def random_episodes(env: Env, key: Key[Array, ""], ticks: int) -> State:
 
 
 def still(ended: np.ndarray) -> int:
-    """Choose the tick to show of `ended` [T]: the middle of the longest episode, where nothing has just begun."""
+    """Return the tick in the middle of the longest episode of `ended` [T]."""
     edges = np.concatenate([[0], np.flatnonzero(ended), [len(ended)]])
     longest = np.argmax(np.diff(edges))
     return int((edges[longest] + edges[longest + 1]) // 2)
 
 
 def contact_sheet(tiles: dict[str, UInt8[np.ndarray, "height width 3"]]) -> Image.Image:
-    """Lay pictures of one size on a grid, each with its name below; the grid has as few empty places as possible."""
+    """Arrange pictures of one size on a grid with the fewest empty places, each with its name below."""
     height, width, _ = next(iter(tiles.values())).shape
     columns = min(range(3, 6), key=lambda n: (-len(tiles) % n, abs(n - 4))) if len(tiles) > 3 else len(tiles)
     rows = math.ceil(len(tiles) / columns)

@@ -21,7 +21,7 @@ SUCCESS_RADIUS = 5.0  # m, of HIRO
 
 
 class TurningState(PhysicsState):
-    """The simulation, and how far the ant has turned."""
+    """The simulation, and the ant's turns."""
 
     turns: Array  # [] since the start of the episode, left is positive
 
@@ -49,24 +49,21 @@ class ArenaState(PhysicsState):
 
 
 class AntArena(Locomotion):
-    """Reach the goal of an arena: reward = -distance in m at each tick; nothing ends the episode but its limit.
+    """Reach the goal of an arena: reward = -distance in m at each tick; only the time limit ends the episode.
 
-    To fall over does not end it either: where every reward is negative, that would be worth it. A simulation
-    that diverges is cut, not terminated, in its last finite state.
+    A fall does not: as every reward is negative, it would pay to fall. A simulation that diverges is truncated, not
+    terminated, in its last finite state.
 
-    Observation: the 27 entries of `ant`, heights from the ground of the start, so that options learnt there
-    apply; then the position [2], the way to the goal [2 or 3], and the way to the block [3] where there is one.
+    Observation: the 27 entries of `ant`, heights from the ground of the start, so that options learnt there apply; then
+    the position [2], the way to the goal [2 or 3], and the way to a block [3].
 
     Args:
-      name: the task's.
-      arena: the room.
-      body: of the ant, see `with_body`; options learnt on `ant` apply where it has the same.
-      goal: `fixed`; `near`, where the arena has one; or, as in HIRO's maze, `uniform` in the room while training and
-        fixed in evaluation.
-      backend, num_threads: see `make_physics`.
+      body: of the ant, see `with_body`; options learnt on an `ant` of the same body apply.
+      goal: `fixed`; `near`, if the arena has one; or, as in HIRO's maze, `uniform` in the room in training and fixed in
+        evaluation.
 
     Raises:
-      UnknownNameError: if there is no such body or goal.
+      UnknownNameError: there is no such body or goal.
     """
 
     def __init__(
@@ -85,23 +82,20 @@ class AntArena(Locomotion):
     @property
     def evaluated(self) -> "AntArena":
         """This arena with its fixed goal."""
-        if not self.uniform_goal:
-            return self
         arena = copy.copy(self)
         arena.uniform_goal = False
         return arena
 
     def reset(self, key: Key[Array, ""]) -> State:
-        """Start near the origin with Gym's noise, the block where it belongs."""
+        """Start near the origin with Gym's noise, the block at its place."""
         key_body, key_goal = jax.random.split(key)
         state = super().reset(key_body)
-        if self.uniform_goal:
-            low, high = jnp.array(self.arena.room).reshape(2, 2)
-            goal = jax.random.uniform(key_goal, (2,), minval=low, maxval=high)
-            physics = state.physics.replace(goal=goal)
-            physics = physics.replace(closest=self._distance(physics))
-            state = state.replace(physics=physics, obs=self._observe(physics))
-        return state
+        if not self.uniform_goal:
+            return state
+        low, high = jnp.array(self.arena.room).reshape(2, 2)
+        physics = state.physics.replace(goal=jax.random.uniform(key_goal, (2,), minval=low, maxval=high))
+        physics = physics.replace(closest=self._distance(physics))
+        return state.replace(physics=physics, obs=self._observe(physics))
 
     def step(self, state: State, action: Float[Array, " A"]) -> State:
         """Simulate one tick and measure the distance."""
@@ -159,13 +153,9 @@ class AntArena(Locomotion):
 
     def _judge(self, before: ArenaState, after: ArenaState, action: Float[Array, " A"]) -> Judgement:
         distance = self._distance(after)
-        metrics = {
-            "distance": distance,
-            "success": (distance < SUCCESS_RADIUS).astype(jnp.float32),
-            "closest_approach": after.closest,
-            "upside_down": upside_down(after.qpos[3:7]).astype(jnp.float32),
-        }
-        return -distance, metrics
+        flags = {"success": distance < SUCCESS_RADIUS, "upside_down": upside_down(after.qpos[3:7])}
+        metrics = {name: flag.astype(jnp.float32) for name, flag in flags.items()}
+        return -distance, metrics | {"distance": distance, "closest_approach": after.closest}
 
 
 def heading(quaternion: Float[Array, " 4"]) -> Float[Array, ""]:

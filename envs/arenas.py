@@ -1,7 +1,7 @@
 """The three arenas of HIRO as data, and the ant's model in one of them.
 
-Each is a rectangular room with at most three solids (a bar, pillars or platforms, all 4 m high) and perhaps a
-movable block. The outer walls are four planes, the cheapest shape to collide with, and solids are boxes.
+Each is a rectangular room with at most three solids (a bar, pillars or platforms, all 4 m high) and at most one movable
+block. The outer walls are four planes, the cheapest shape for collisions, and solids are boxes.
 """
 
 import dataclasses
@@ -14,8 +14,8 @@ ANT_QPOS, ANT_QVEL = 15, 14  # the ant's share of qpos and qvel; a block's follo
 SOLID_HEIGHT = 4.0  # m
 TOLERANCE = 0.05  # m, by which a block may overrun its soft limits
 
-# Bits for contype and conaffinity: which pairs may collide. The ant meets everything but itself. A block meets
-# the solids named by its arena; everywhere else its joint limits hold it, and contacts would make it jam.
+# Bits of contype and conaffinity for pairs that may collide. The ant collides with everything but itself, a block with
+# the solids that its arena names; elsewhere its joint limits stop it, and contacts would make it jam.
 _ANT, _BLOCK = 1, 2
 _GEOM = mujoco.mjtGeom
 
@@ -38,9 +38,9 @@ class Block:
 
     centre: tuple[float, float, float]  # m
     slides: tuple[Slide, ...]
-    meets: tuple[int, ...]  # solids it can touch
+    meets: tuple[int, ...]  # solids in its way
     half: tuple[float, float, float] = (3.96, 3.96, 2.0)  # m; a block as wide as its corridor would jam
-    mass: float = 0.1  # kg; HIRO's 0.2 and 1 g went through walls at a steady push
+    mass: float = 0.1  # kg; HIRO's 0.2 and 1 g go through walls at a steady push
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,46 +50,37 @@ class Arena:
     room: tuple[float, float, float, float]  # x_low, y_low, x_high, y_high
     solids: tuple[tuple[float, float, float, float], ...]  # likewise
     goal: tuple[float, ...]  # 2 coordinates, or 3 where height counts
-    near_goal: tuple[float, ...] | None = None  # one that nothing stands before
+    near_goal: tuple[float, ...] | None = None  # one without obstacles before it
     ground: float = 0.0  # height of the ground on which the ant starts
     block: Block | None = None
 
 
-MAZE = Arena(
-    room=(-4.0, -4.0, 20.0, 20.0),
-    solids=((-4.0, 4.0, 12.0, 12.0),),
-    goal=(0.0, 16.0),
-    near_goal=(16.0, 0.0),  # as far off, but at the end of the first corridor
+MAZE = Arena(  # the near goal is as far off, but at the end of the first corridor
+    room=(-4.0, -4.0, 20.0, 20.0), solids=((-4.0, 4.0, 12.0, 12.0),), goal=(0.0, 16.0), near_goal=(16.0, 0.0)
 )
+_ALONG_X, _ALONG_Y = Slide((1.0, 0.0, 0.0), (-8.0, 8.0), 1.0), Slide((0.0, 1.0, 0.0), (-8.0, 8.0), 1.0)
 PUSH = Arena(
     room=(-12.0, -4.0, 12.0, 20.0),
     solids=((4.0, -4.0, 12.0, 4.0), (-12.0, 12.0, -4.0, 20.0), (4.0, 12.0, 12.0, 20.0)),
     goal=(0.0, 19.0),
-    block=Block(
-        centre=(0.0, 8.0, 2.0),
-        slides=(Slide((1.0, 0.0, 0.0), (-8.0, 8.0), 1.0), Slide((0.0, 1.0, 0.0), (-8.0, 8.0), 1.0)),
-        meets=(0, 1, 2),
-    ),
+    block=Block(centre=(0.0, 8.0, 2.0), slides=(_ALONG_X, _ALONG_Y), meets=(0, 1, 2)),
 )
+# The block of the fall may rise a little: a limit at 0 would press it against the platform. Its fall is not damped.
+_DOWN = Slide((0.0, 0.0, 1.0), (-4.0, 0.1), 0.0)
 FALL = Arena(
     room=(-4.0, -4.0, 12.0, 28.0),
     solids=((-4.0, -4.0, 12.0, 12.0), (-4.0, 20.0, 12.0, 28.0)),  # platforms before and behind a chasm 4 m deep
     goal=(0.0, 27.0, 4.5),
     ground=4.0,
-    block=Block(
-        centre=(8.0, 8.0, 6.0),
-        # It may rise a little: a limit at 0 would press it against the platform. Its fall is not damped.
-        slides=(Slide((0.0, 1.0, 0.0), (-8.0, 8.0), 1.0), Slide((0.0, 0.0, 1.0), (-4.0, 0.1), 0.0)),
-        meets=(0,),
-    ),
+    block=Block(centre=(8.0, 8.0, 6.0), slides=(_ALONG_Y, _DOWN), meets=(0,)),
 )
 
 
 def furnish(spec: mujoco.MjSpec, arena: Arena) -> None:
     """Put the ant of `spec` into the arena; all its 13 body geoms collide with floor, walls, solids and block.
 
-    An ant that never ends an episode can lie on its back, where feet alone would let it sink into the floor.
-    The floor is met by the same shapes as in `ant`: its foot spheres are the ends of the ankles' capsules.
+    An ant whose fall ends no episode can lie on its back, where feet alone would let it sink into the floor. The floor
+    collides with the same shapes as in `ant`: its foot spheres are the ends of the ankles' capsules.
     """
     for geom in spec.geoms:
         if geom.name == "floor":
@@ -97,11 +88,14 @@ def furnish(spec: mujoco.MjSpec, arena: Arena) -> None:
         else:
             is_foot = geom.type == _GEOM.mjGEOM_SPHERE and geom.name != "torso_geom"
             geom.contype, geom.conaffinity = (0, 0) if is_foot else (_ANT, 0)
-            geom.rgba = _BODY  # to be seen from above
+            geom.rgba = _BODY  # visible from above
     _add_walls(spec, arena)
-    for i, solid in enumerate(arena.solids):
+    for i, (x_low, y_low, x_high, y_high) in enumerate(arena.solids):
         meets = _ANT | (_BLOCK if arena.block and i in arena.block.meets else 0)
-        _add_solid(spec, f"solid_{i}", solid, meets)
+        pos = ((x_low + x_high) / 2, (y_low + y_high) / 2, SOLID_HEIGHT / 2)
+        half = ((x_high - x_low) / 2, (y_high - y_low) / 2, SOLID_HEIGHT / 2)
+        shape = {"type": _GEOM.mjGEOM_BOX, "pos": pos, "size": half, "rgba": _WALL}
+        spec.worldbody.add_geom(name=f"solid_{i}", **shape, contype=0, conaffinity=meets)
     if arena.block:
         _add_block(spec, arena.block)
     goal = (*arena.goal, arena.ground + 0.5)[:3]
@@ -126,49 +120,32 @@ def outside(arena: Arena, qpos: Float[np.ndarray, "*batch nq"]) -> int:
 def _add_walls(spec: mujoco.MjSpec, arena: Arena) -> None:
     x_low, y_low, x_high, y_high = arena.room
     x, y, height = (x_low + x_high) / 2, (y_low + y_high) / 2, arena.ground + SOLID_HEIGHT
-    for name, place, inward in (
-        ("west", (x_low, y), (1, 0)),
-        ("south", (x, y_low), (0, 1)),
-        ("east", (x_high, y), (-1, 0)),
-        ("north", (x, y_high), (0, -1)),
-    ):
+    sides = {
+        "west": ((x_low, y), (1, 0)), "south": ((x, y_low), (0, 1)),
+        "east": ((x_high, y), (-1, 0)), "north": ((x, y_high), (0, -1)),
+    }  # fmt: skip
+    for name, (place, inward) in sides.items():
         half_length = (y_high - y_low if inward[0] else x_high - x_low) / 2
-        pos, size = (*place, height / 2), (height / 2, half_length, 1)
-        wall = spec.worldbody.add_geom(
-            name=name, type=_GEOM.mjGEOM_PLANE, pos=pos, size=size, rgba=_WALL, contype=0, conaffinity=_ANT
-        )
-        # A plane's normal is its z axis; its x axis, the first of its sizes as drawn, points up.
+        shape = {"type": _GEOM.mjGEOM_PLANE, "pos": (*place, height / 2), "size": (height / 2, half_length, 1)}
+        wall = spec.worldbody.add_geom(name=name, **shape, rgba=_WALL, contype=0, conaffinity=_ANT)
+        # A plane's normal is its z axis; its x axis, the first of its sizes in a picture, points up.
         wall.alt.type = mujoco.mjtOrientation.mjORIENTATION_XYAXES
         wall.alt.xyaxes = (0, 0, 1, inward[1], -inward[0], 0)
-
-
-def _add_solid(spec: mujoco.MjSpec, name: str, rectangle: tuple[float, ...], meets: int) -> None:
-    x_low, y_low, x_high, y_high = rectangle
-    pos = ((x_low + x_high) / 2, (y_low + y_high) / 2, SOLID_HEIGHT / 2)
-    half = ((x_high - x_low) / 2, (y_high - y_low) / 2, SOLID_HEIGHT / 2)
-    spec.worldbody.add_geom(
-        name=name, type=_GEOM.mjGEOM_BOX, pos=pos, size=half, rgba=_WALL, contype=0, conaffinity=meets
-    )
 
 
 def _add_block(spec: mujoco.MjSpec, block: Block) -> None:
     body = spec.worldbody.add_body(name="block", pos=block.centre)
     for i, slide in enumerate(block.slides):
         body.add_joint(
-            name=f"block_{i}",
-            type=mujoco.mjtJoint.mjJNT_SLIDE,
-            axis=slide.axis,
-            limited=mujoco.mjtLimited.mjLIMITED_TRUE,
-            range=slide.limits,
-            damping=[slide.damping, 0, 0],
-            armature=0,
-        )
+            name=f"block_{i}", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=slide.axis, armature=0,
+            limited=mujoco.mjtLimited.mjLIMITED_TRUE, range=slide.limits, damping=[slide.damping, 0, 0],
+        )  # fmt: skip
     shape = {"type": _GEOM.mjGEOM_BOX, "size": block.half, "mass": block.mass, "rgba": _MOVABLE}
     body.add_geom(name="block", **shape, contype=_BLOCK, conaffinity=_ANT)
 
 
 def _add_camera(spec: mujoco.MjSpec, arena: Arena) -> None:
-    """Look at the whole room from above, tilted a little so that heights show."""
+    """Add a camera above the whole room, tilted a little so that heights are visible."""
     x_low, y_low, x_high, y_high = arena.room
     tilt, away = np.deg2rad(25), 1.35 * max(y_high - y_low, 0.8 * (x_high - x_low))
     pos = ((x_low + x_high) / 2, (y_low + y_high) / 2 - away * np.sin(tilt), arena.ground + away * np.cos(tilt))

@@ -36,7 +36,7 @@ class State(struct.PyTreeNode):
 
     @classmethod
     def first(cls, physics: Any, obs: Float[Array, " S"], metrics: dict[str, Array]) -> "State":
-        """Return an episode's first state: nothing earned, nothing ended."""
+        """Return an episode's first state, without reward and end."""
         no = jnp.zeros((), bool)
         return cls(physics, obs, jnp.zeros(()), terminated=no, truncated=no, metrics=metrics)
 
@@ -48,18 +48,18 @@ class Env(abc.ABC):
     observation_size: int
     action_size: int
     proprioceptive_size: int  # the leading entries of obs that describe the body alone
-    proprioception: str  # name of that slice; may be missing: then it is the task's own, and no other task shares it
+    proprioception: str  # name of that slice; without it no other task shares the slice
     episode_length: int  # ticks
     dt: float  # seconds a tick
 
     @property
     def views(self) -> Views:
-        """Ways to see the same motion of the body: one, unless it is symmetric."""
+        """Views of the body's motion: one, unless the body is symmetric."""
         return one_view(self.proprioceptive_size, self.action_size)
 
     @property
     def evaluated(self) -> "Env":
-        """The task as evaluation sets it: this one, but where training draws at random and evaluation does not."""
+        """The task in evaluation: this one, without the draws of training alone."""
         return self
 
     @abc.abstractmethod

@@ -18,9 +18,7 @@ _METHODS = ("reset", "step", "render")
 
 
 def check_contract(env: Env) -> None:
-    """Refuse an environment that breaks the contract of `Env`, by abstract evaluation alone.
-
-    Of `TimeLimit` and `AutoReset` only the attributes are checked, besides the whole environment inside.
+    """Check the contract of `Env` by abstract evaluation alone; of `TimeLimit` and `AutoReset` the attributes alone.
 
     Raises:
       ContractError: the first breach; the message starts with the environment's name and the field.
@@ -60,7 +58,7 @@ def _check_attributes(env: Env) -> None:
 
 
 def _trace(env: Env, method: str, *arguments: Any) -> State:
-    """Call a method on abstract arrays; the error names its exception and the line of the environment's own file."""
+    """Call a method on abstract arrays; the error has the exception and the line of the environment's own file."""
     try:
         state = jax.eval_shape(getattr(env, method), *arguments)
     except Exception as error:
@@ -74,45 +72,41 @@ def _trace(env: Env, method: str, *arguments: Any) -> State:
 
 
 def _check_state(env: Env, method: str, state: Any) -> None:
-    """Compare a method's result with the shapes and dtypes that `State` promises."""
+    """Compare a method's result with the shapes and dtypes of `State`."""
     if not isinstance(state, State):
         raise ContractError(env.name, method, f"returns {type(state).__name__}, expected State")
     if not isinstance(state.metrics, dict):
         raise ContractError(env.name, "metrics", f"{method} returns {type(state.metrics).__name__}, expected dict")
+    vector, number = (jax.ShapeDtypeStruct(shape, jnp.float32) for shape in ((env.observation_size,), ()))
+    flag = jax.ShapeDtypeStruct((), jnp.bool_)
     expected = {
-        "obs": (state.obs, (env.observation_size,), jnp.float32),
-        "reward": (state.reward, (), jnp.float32),
-        "terminated": (state.terminated, (), jnp.bool_),
-        "truncated": (state.truncated, (), jnp.bool_),
-        **{f"metrics[{name!r}]": (value, (), jnp.float32) for name, value in state.metrics.items()},
-    }
-    for field, (value, shape, dtype) in expected.items():
-        promised = jax.ShapeDtypeStruct(shape, dtype)
-        if not isinstance(value, jax.ShapeDtypeStruct) or (value.shape, value.dtype) != (shape, promised.dtype):
-            raise ContractError(env.name, field, f"{method} returns {_show(value)}, expected {_show(promised)}")
+        "obs": (state.obs, vector), "reward": (state.reward, number),
+        "terminated": (state.terminated, flag), "truncated": (state.truncated, flag),
+        **{f"metrics[{name!r}]": (value, number) for name, value in state.metrics.items()},
+    }  # fmt: skip
+    for field, (value, right) in expected.items():
+        if not isinstance(value, jax.ShapeDtypeStruct) or (value.shape, value.dtype) != (right.shape, right.dtype):
+            raise ContractError(env.name, field, f"{method} returns {_show(value)}, expected {_show(right)}")
 
 
 def _check_same(env: Env, start: State, method: str, after: State) -> None:
-    """Refuse a method that changes structure, shapes, dtypes or weak types of what reset made."""
+    """Refuse a method whose state differs from reset's in structure, shapes, dtypes or weak types."""
     if start.metrics.keys() != after.metrics.keys():
         new, old = ("{" + ", ".join(sorted(map(repr, state.metrics))) + "}" for state in (after, start))
         raise ContractError(env.name, "metrics", f"{method} returns {new}, reset returns {old}")
     for field in State.__dataclass_fields__:
         trees = getattr(after, field), getattr(start, field)
-        leaves = [
-            {field + jax.tree_util.keystr(path): leaf for path, leaf in jax.tree.leaves_with_path(tree)}
-            for tree in trees
-        ]
+        leaves = [{jax.tree_util.keystr(path): x for path, x in jax.tree.leaves_with_path(tree)} for tree in trees]
         for path in leaves[1] | leaves[0]:
             new, old = (_show(each.get(path)) for each in leaves)
             if new != old:
-                raise ContractError(env.name, path, f"{method} returns {new}, reset returns {old}")
+                raise ContractError(env.name, field + path, f"{method} returns {new}, reset returns {old}")
         if jax.tree.structure(trees[0]) != jax.tree.structure(trees[1]):
             raise ContractError(env.name, field, f"{method} returns another kind of tree than reset")
 
 
 def _show(value: Any) -> str:
-    """Write an abstract array as float32[3], with what else decides whether a program compiles again."""
+    """Return an abstract array as float32[3], with its weak type if it has one."""
     if value is None:
         return "nothing"
     if not isinstance(value, jax.ShapeDtypeStruct):

@@ -22,17 +22,14 @@ class CustomEnvError(ValueError):
 
 
 def load_custom(name: str, backend: str = "auto", num_threads: int = 0) -> Env:
-    """Import a subclass of `Env` and make one; a file is imported once, however often it is named.
+    """Make an environment of `FILE.py:CLASS` or `MODULE:CLASS`; a file is imported once.
 
-    Args:
-      name: `FILE.py:CLASS` or `MODULE:CLASS`.
-      backend: for the class if its `__init__` has a parameter of this name (see `physics.make_physics`).
-      num_threads: likewise.
+    The class receives those of `backend` and `num_threads` that are parameters of its `__init__`.
 
     Raises:
-      UnknownNameError: if the module has no such class; the message names its nearest subclass of `Env`.
-      CustomEnvError: if there is no such file or module, if it is not a subclass of `Env` or an abstract one,
-        or if importing or making it raises.
+      UnknownNameError: the module has no such class; the message names its nearest subclass of `Env`.
+      CustomEnvError: there is no such file or module, the class is no subclass of `Env` or an abstract one, or its
+        import or `__init__` raises.
     """
     source, _, class_name = name.rpartition(":") if not name.endswith(".py") else (name, "", "")
     if not source:
@@ -48,13 +45,13 @@ def load_custom(name: str, backend: str = "auto", num_threads: int = 0) -> Env:
 
 
 def _load_file(source: str) -> ModuleType:
-    """Import a file under a name that no other module can have; a second time, return the same module."""
+    """Import a file under a unique name; a second time, return the same module."""
     path = Path(source).resolve()
     if not path.is_file():
         similar = nearest(path.name, (file.name for file in path.parent.glob("*.py")))
         hint = f"the nearest is {Path(source).parent / similar}" if similar else f"{path.parent} holds no .py files"
         raise CustomEnvError(f"environment in {source}: no such file; {hint}")
-    # Not derived from the file's name: that may be the name of another module, or have dots, i.e. a parent.
+    # The file's own name may be that of another module, or have dots, i.e. a parent.
     name = f"custom_env_{hashlib.sha256(str(path).encode()).hexdigest()}"
     if name in sys.modules:
         return sys.modules[name]
@@ -104,7 +101,7 @@ def _is_environment(value: Any) -> bool:
 
 
 def _failed(doing: str, path: str | None, error: BaseException) -> NoReturn:
-    """Raise what went wrong in the user's code, with the innermost line of `path`, or else of any file."""
+    """Raise the error of the user's code in one line, with the innermost line of `path`, or else of any file."""
     frames = traceback.extract_tb(error.__traceback__)
     frame = ([frame for frame in frames if frame.filename == path] or frames)[-1]
     message = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__

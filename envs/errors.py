@@ -1,11 +1,11 @@
-"""Errors a user can cause or mend; one line each."""
+"""Errors that a user can cause or correct; one line each."""
 
 import difflib
 from collections.abc import Iterable
 
 
 def nearest(name: str, names: Iterable[str], cutoff: float = 0.0) -> str | None:
-    """Return the name most like `name`, or None where the likeness, from 0 to 1, is below the cutoff for all."""
+    """Return the name most like `name`, or None if the likeness of all, from 0 to 1, is below the cutoff."""
     return next(iter(difflib.get_close_matches(name, list(names), n=1, cutoff=cutoff)), None)
 
 
@@ -23,15 +23,15 @@ class MissingExtraError(ImportError, ValueError):
     """A package that is not installed; the message gives the line that installs it, None being no extra."""
 
     def __init__(self, package: str, extra: str | None):
-        wanted = f"taic-jax[{extra}]" if extra else "taic-jax"
-        super().__init__(f"the package {package} is not installed: pip install '{wanted}'", name=package)
+        requirement = f"taic-jax[{extra}]" if extra else "taic-jax"
+        super().__init__(f"the package {package} is not installed: pip install '{requirement}'", name=package)
 
 
 class BackendError(ValueError):
     """A physics backend that does not run on this machine."""
 
-    def __init__(self, backend: str, needed: str):
-        super().__init__(f"env.backend: {backend} needs {needed}; the nearest that runs here is mjx")
+    def __init__(self, backend: str, requirement: str):
+        super().__init__(f"env.backend: {backend} needs {requirement}; the nearest that runs here is mjx")
 
 
 class EnvOptionError(ValueError):
@@ -43,7 +43,7 @@ class EnvOptionError(ValueError):
 
 
 class AdapterError(ValueError):
-    """An environment that cannot stand on the other side of an adapter, or is used there against the rules."""
+    """An environment that does not fit an adapter, or a wrong use of an adapter."""
 
 
 class ContractError(ValueError):

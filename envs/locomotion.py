@@ -15,16 +15,14 @@ from taic_jax.envs.rendering import render_mujoco
 from taic_jax.envs.robots import Robot, compile_spec, initial_qpos, load_spec
 from taic_jax.envs.views import Views, make_views
 
-Judgement = tuple[Float[Array, ""], dict[str, Array]]
-"""A reward, or a term of it, and metrics."""
+Judgement = tuple[Float[Array, ""], dict[str, Array]]  # A reward, or a term of it, and metrics.
 
 
 class Locomotion(Env):
     """Run along x: reward = dx/dt + healthy_reward - control_cost |a|^2 each tick.
 
-    Observation: qpos without the place on the ground, then qvel. Positions are read from qpos, which, unlike
-    the world positions of bodies, is current after a step. A simulation that diverges ends the episode in its
-    last finite state. For `backend` and `num_threads` see `make_physics`.
+    Observation: qpos without the place on the ground, then qvel. Positions are those of qpos, which, unlike the world
+    positions of bodies, are current after a step. A simulation that diverges ends the episode in its last finite state.
     """
 
     def __init__(self, name: str, robot: Robot, backend: str = "auto", num_threads: int = 0):
@@ -60,23 +58,14 @@ class Locomotion(Env):
         return State.first(physics, self._observe(physics), metrics)
 
     def step(self, state: State, action: Float[Array, " A"]) -> State:
-        """Simulate one tick and pay for it.
-
-        Where the engine finds the simulation unstable, the robot stays where it was, the episode ends, and metric
-        `unstable` is 1.
-        """
+        """Simulate and reward one tick; an unstable one ends the episode at its start, and metric `unstable` is 1."""
         before, after = state.physics, self.physics.step(state.physics, action)
         finite = jnp.all(jnp.isfinite(jnp.concatenate([after.qpos, after.qvel])))
         after = self._advance(before, jax.tree.map(lambda new, old: jnp.where(finite, new, old), after, before))
         reward, metrics = self._judge(before, after, action)
-        return state.replace(
-            physics=after,
-            obs=self._observe(after),
-            reward=reward,
-            terminated=~finite | ~self._is_healthy(after),
-            truncated=jnp.zeros((), bool),
-            metrics=metrics | {"unstable": (~finite).astype(jnp.float32)},
-        )
+        metrics |= {"unstable": (~finite).astype(jnp.float32)}
+        flags = {"terminated": ~finite | ~self._is_healthy(after), "truncated": jnp.zeros((), bool)}
+        return state.replace(physics=after, obs=self._observe(after), reward=reward, metrics=metrics, **flags)
 
     def render(self, physics: PhysicsState, *, height: int = 240, width: int = 320) -> np.ndarray:
         """Draw with MuJoCo's renderer, from the tracking camera."""

@@ -21,15 +21,13 @@ START, GOAL = (1.0, 5.0), (9.0, 5.0)  # m, of the task with fixed ends
 BASE_MAP = np.array(
     [[4.8, 0.0, 5.2, 4.0], [4.8, 6.0, 5.2, 8.5], [2.0, 2.0, 3.0, 3.5], [7.0, 8.0, 8.0, 8.6]], np.float32
 )
-
-
-# It appears later (section 4.1, figure 4): a pocket behind the wall's lower gap. The shortest way ends 1.8 m behind
+# The sudden change of section 4.1, figure 4: a pocket behind the wall's lower gap. The shortest way ends 1.8 m behind
 # that gap; only the upper one still leads to the goal.
 TRAP = np.array([[7.0, 3.0, 7.4, 7.0], [5.2, 2.8, 7.4, 3.2], [5.2, 6.8, 7.4, 7.2]], np.float32)
 
 
 class NavigationState(struct.PyTreeNode):
-    """The point's position and goal, and how often it has tried."""
+    """The point's position and goal, and its number of episodes."""
 
     position: Array  # [2] m
     goal: Array  # [2] m
@@ -40,10 +38,10 @@ class Navigation(Env):
     """Reach the goal: reward +100 there, which ends the episode, and -1 at every other tick.
 
     The action is the velocity. A move along one axis that would end inside an obstacle is cancelled, so the
-    point slides along walls. Observation: position / 5 - 1, and the goal alike where it varies.
+    point slides along walls. Observation: position / 5 - 1, and a random goal likewise.
 
     Args:
-      walls: rectangles [R, 4] in m; may be traced, so that a program can change the map without recompiling.
+      walls: rectangles in m; may be traced, so that a program can change the map without recompiling.
       random_ends: draw start and goal uniformly from free space each episode, and observe the goal.
       change_after: episodes of each environment after which `TRAP` stands in the room too; 0 for never.
     """
@@ -59,11 +57,9 @@ class Navigation(Env):
     ):
         self.name = "nav2d_random" if random_ends else "nav2d"
         self.observation_size = 4 if random_ends else 2
-        self.random_ends = random_ends
-        self.change_after = change_after
-        # From which episode each wall stands there.
-        since = [0] * len(walls) + [change_after] * len(TRAP)
+        self.random_ends, self.change_after = random_ends, change_after
         self.walls = jnp.concatenate([jnp.asarray(walls), TRAP]) if change_after else jnp.asarray(walls)
+        since = [0] * len(walls) + [change_after] * len(TRAP)  # the first episode of each wall
         self._since = np.array(since[: len(self.walls)], np.int32)
         if random_ends:
             self._cells, self._num_cells = free_cells(self.walls)
@@ -73,7 +69,7 @@ class Navigation(Env):
         return self._start(key, jnp.zeros((), jnp.int32))
 
     def restart(self, key: Key[Array, ""], ended: NavigationState) -> State:
-        """Put the point on its start, in the room as it is after one more episode."""
+        """Put the point on its start, in the room of the next episode."""
         return self._start(key, ended.episode + 1)
 
     def _start(self, key: Key[Array, ""], episode: Int[Array, ""]) -> State:
@@ -93,17 +89,12 @@ class Navigation(Env):
         physics = state.physics.replace(position=jnp.stack([x, y]))
         metrics = self._metrics(physics)
         success = metrics["success"] > 0
-        return state.replace(
-            physics=physics,
-            obs=self._observe(physics),
-            reward=jnp.where(success, jnp.float32(100.0), jnp.float32(-1.0)),
-            terminated=success,
-            truncated=jnp.zeros((), bool),
-            metrics=metrics,
-        )
+        reward = jnp.where(success, jnp.float32(100.0), jnp.float32(-1.0))
+        flags = {"terminated": success, "truncated": jnp.zeros((), bool)}
+        return state.replace(physics=physics, obs=self._observe(physics), reward=reward, metrics=metrics, **flags)
 
     def render(self, physics: NavigationState, *, height: int = 240, width: int = 320) -> np.ndarray:
-        """Draw room, obstacles, start, goal, and the episode's path so far: a move too long for a tick is a reset."""
+        """Draw room, obstacles, start, goal, and the episode's path; a move too long for a tick is a reset."""
         from matplotlib.backends.backend_agg import FigureCanvasAgg  # matplotlib takes a while to import
         from matplotlib.figure import Figure
         from matplotlib.patches import Circle, Rectangle
@@ -115,9 +106,7 @@ class Navigation(Env):
         axes.set(xticks=[], yticks=[], facecolor=_FLOOR)
         for spine in axes.spines.values():
             spine.set(color=_WALL, linewidth=2)
-        patches = [
-            Rectangle((x, y), x_high - x, y_high - y, color=_WALL) for x, y, x_high, y_high in np.asarray(self.walls)
-        ]
+        patches = [Rectangle((x, y), right - x, top - y, color=_WALL) for x, y, right, top in np.asarray(self.walls)]
         target = Circle((0, 0), GOAL_RADIUS, color=_GOAL, alpha=0.6, linewidth=0)
         for patch in (*patches, target):
             axes.add_patch(patch)
@@ -153,7 +142,7 @@ class Navigation(Env):
         return metrics
 
     def _standing(self, episode: Int[Array | np.ndarray, "*T 1"]) -> Bool[Array | np.ndarray, "*T R"]:
-        """Return which walls stand in which episode."""
+        """Return for each episode the walls that stand."""
         return self._since <= episode
 
     def _free_point(self, uniform: Float[Array, " 3"]) -> Float[Array, " 2"]:
@@ -171,7 +160,7 @@ def inside(
 
 @jax.jit
 def free_cells(walls: Float[Array, "R 4"]) -> tuple[Float[Array, "M 2"], Array]:
-    """Raster the room; return the cells' lower corners, those of free cells first, and how many are free."""
+    """Raster the room; return the cells' lower corners, those of free cells first, and the number of free ones."""
     axis = CELL * jnp.arange(round(ROOM / CELL), dtype=jnp.float32)
     corners = jnp.stack(jnp.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
     low, high = walls[None, :, :2], walls[None, :, 2:]

@@ -17,26 +17,17 @@ Frames = UInt8[np.ndarray, "T height width 3"]
 
 
 def render_mujoco(
-    model: mujoco.MjModel,
-    qpos: Float[Array | np.ndarray, "T nq"],
-    *,
-    height: int,
-    width: int,
-    camera: str = "track",
-    site: Float[np.ndarray, "T 3"] | None = None,
-) -> Frames:
-    """Draw a trajectory of poses.
+    model: mujoco.MjModel, qpos: Float[Array | np.ndarray, "T nq"], *, height: int, width: int,
+    camera: str = "track", site: Float[np.ndarray, "T 3"] | None = None,
+) -> Frames:  # fmt: skip
+    """Draw a trajectory of poses, in pixels.
 
     Args:
-      model: compiled model.
-      qpos: the poses.
-      height: pixels.
-      width: pixels.
-      camera: name of the model's camera; where it has none of that name, a free one looks at the whole scene.
+      camera: of the model; if it has none of that name, a free one looks at the whole scene.
       site: places in m for the model's first site, which marks a goal.
 
     Raises:
-      RenderingError: if there is no OpenGL.
+      RenderingError: there is no OpenGL.
     """
     model.vis.global_.offwidth = max(model.vis.global_.offwidth, width)
     model.vis.global_.offheight = max(model.vis.global_.offheight, height)
@@ -69,6 +60,5 @@ def _make_renderer(model: mujoco.MjModel, height: int, width: int) -> mujoco.Ren
 def write_webp(file: Path | BinaryIO, frames: Frames, dt: float) -> None:
     """Write frames that are `dt` seconds apart as an animation in real time, at most 25 a second."""
     every = max(round(0.04 / dt), 1)
-    images = [Image.fromarray(frame) for frame in frames[::every]]
-    duration = round(1000 * dt * every)
-    images[0].save(file, format="webp", save_all=True, append_images=images[1:], duration=duration, loop=0)
+    first, *others = [Image.fromarray(frame) for frame in frames[::every]]
+    first.save(file, format="webp", save_all=True, append_images=others, duration=round(1000 * dt * every), loop=0)

@@ -1,4 +1,4 @@
-"""The four running robots as data: which MJCF, and the constants of Gym's reward, start and end."""
+"""The four running robots as data: MJCF, and the constants of Gym's reward, start and end."""
 
 import dataclasses
 import importlib.util
@@ -15,7 +15,7 @@ from taic_jax.envs.views import Signed
 
 @dataclasses.dataclass(frozen=True)
 class Robot:
-    """A body and the constants that its tasks take from it."""
+    """A body and the constants of its tasks."""
 
     mjcf: tuple[str, str]  # package that ships it, path in it
     num_unobserved: int  # leading entries of qpos left out of obs: the place on the ground
@@ -34,14 +34,13 @@ class Robot:
     start_in_default_pose: bool = False  # and not in the model's numeric `init_qpos`
     episode_length: int = 1000  # ticks
     proprioception: str = ""  # name of the slice of obs that its tasks share; empty for the task's
-    # Of the engine; None for the model's own.
+    # Settings of the engine; None for the model's own.
     timestep: float | None = None  # s
     integrator: mujoco.mjtIntegrator | None = None
     gear: float | None = None  # N m, of every motor at an action of 1
-    # MJX's solver and line search; None for the model's own. `experiments.benchmark.worlds --solver` measures them.
-    iterations: int | None = None
-    ls_iterations: int | None = 4
-    # Obs and action as seen from the next of `sides` equal sides of the body (see `views`).
+    iterations: int | None = None  # of MJX's solver; `experiments.benchmark.worlds --solver` measures both
+    ls_iterations: int | None = 4  # of its line search
+    # Obs and action from the next of `sides` equal sides of the body (see `views`).
     sides: int = 1
     turned_obs: Signed = ()
     turned_action: Signed = ()
@@ -51,10 +50,7 @@ def _brax(name: str) -> tuple[str, str]:
     return "brax", f"envs/assets/{name}.xml"
 
 
-_HALF_CHEETAH = Robot(
-    _brax("half_cheetah"), num_unobserved=1, control_cost=0.1, reset_noise=0.1, velocity_noise="normal"
-)
-# A quarter turn to the left: each leg does what the one to its right did. The ankles' axes point outwards on two
+# A quarter turn to the left: each leg moves as the one to its right did. The ankles' axes point outwards on two
 # opposite legs and inwards on the others, so that their angles change sign from leg to leg.
 _TURNED_VECTOR: Signed = ((1, -1), (0, 1), (2, 1))  # x' = -y, y' = x, z' = z
 _TURNED_LEGS: Signed = ((6, 1), (7, 1), (0, 1), (1, -1), (2, 1), (3, 1), (4, 1), (5, -1))  # hip and ankle, 1 to 4
@@ -65,38 +61,23 @@ def _behind(first: int, turned: Signed) -> Signed:
     return tuple((first + index, sign) for index, sign in turned)
 
 
-_ANT = Robot(
-    _brax("ant"),
-    num_unobserved=2,
-    control_cost=0.5,
-    reset_noise=0.1,
-    velocity_noise="normal",
-    healthy_reward=1.0,
-    healthy_height=(0.2, 1.0),
-    height_index=2,
-    proprioception="ant",
-    sides=4,
-    # Height, quaternion, joints; then the speeds of torso and joints.
-    turned_obs=(
-        *((0, 1), (1, 1), *_behind(2, _TURNED_VECTOR), *_behind(5, _TURNED_LEGS)),
-        *(*_behind(13, _TURNED_VECTOR), *_behind(16, _TURNED_VECTOR), *_behind(19, _TURNED_LEGS)),
-    ),
-    turned_action=_TURNED_MOTORS,
+_TURNED_OBS: Signed = (
+    *((0, 1), (1, 1), *_behind(2, _TURNED_VECTOR), *_behind(5, _TURNED_LEGS)),  # height, quaternion, joints
+    *(*_behind(13, _TURNED_VECTOR), *_behind(16, _TURNED_VECTOR), *_behind(19, _TURNED_LEGS)),  # their speeds
 )
+_HALF_CHEETAH = Robot(
+    _brax("half_cheetah"), num_unobserved=1, control_cost=0.1, reset_noise=0.1, velocity_noise="normal"
+)
+_ANT = Robot(
+    _brax("ant"), num_unobserved=2, control_cost=0.5, reset_noise=0.1, velocity_noise="normal", healthy_reward=1.0,
+    height_index=2, healthy_height=(0.2, 1.0), proprioception="ant",
+    sides=4, turned_obs=_TURNED_OBS, turned_action=_TURNED_MOTORS,
+)  # fmt: skip
 # Brax moved the root joints of hopper and walker2d into the torso, where its height of 1.25 m reads 0.
 _HOPPER = Robot(
-    _brax("hopper"),
-    num_unobserved=1,
-    control_cost=1e-3,
-    reset_noise=5e-3,
-    substeps=4,
-    healthy_reward=1.0,
-    root_height=1.25,
-    healthy_height=(0.7, math.inf),
-    healthy_angle=0.2,
-    healthy_state=100.0,
-    velocity_limit=10.0,
-)
+    _brax("hopper"), num_unobserved=1, control_cost=1e-3, reset_noise=5e-3, substeps=4, healthy_reward=1.0,
+    root_height=1.25, healthy_height=(0.7, math.inf), healthy_angle=0.2, healthy_state=100.0, velocity_limit=10.0,
+)  # fmt: skip
 _WALKER2D = dataclasses.replace(
     _HOPPER, mjcf=_brax("walker2d"), healthy_height=(0.8, 2.0), healthy_angle=1.0, healthy_state=math.inf
 )
@@ -110,10 +91,9 @@ def _as_in_gym(robot: Robot, file: str) -> Robot:
     )
 
 
-BODIES = ("gym", "hiro")
-"""Of the ant, by the config's `env.body`."""
+BODIES = ("gym", "hiro")  # Bodies of the ant, by the config's `env.body`.
 
-# By the config's `env.model`. `gym` is Gymnasium's own MJCF, integrator and rules of version 5, without the
+# Robots by the config's `env.model`. `gym` is Gymnasium's own MJCF, integrator and rules of version 5, without the
 # ant's contact forces, which MJX does not compute and which cost at most 42 an episode.
 ROBOTS: dict[str, dict[str, Robot]] = {
     "brax": _BRAX,
@@ -122,24 +102,19 @@ ROBOTS: dict[str, dict[str, Robot]] = {
 
 
 def with_body(ant: Robot, body: str) -> Robot:
-    """Return the ant with the body of `gym`, as it is; or of `hiro`, with a fifth of its strength and longer ticks."""
+    """Return the ant with the body of `gym`, unchanged, or of `hiro`, with a fifth of its strength and longer ticks."""
     if body not in BODIES:
         raise UnknownNameError("body", body, BODIES)
     if body == "gym":
         return ant
     return dataclasses.replace(
-        ant,
-        start_in_default_pose=True,
-        episode_length=500,
-        proprioception="hiro_ant",
-        timestep=0.02,
-        integrator=mujoco.mjtIntegrator.mjINT_RK4,
-        gear=30.0,
-    )
+        ant, start_in_default_pose=True, episode_length=500, proprioception="hiro_ant",
+        timestep=0.02, integrator=mujoco.mjtIntegrator.mjINT_RK4, gear=30.0,
+    )  # fmt: skip
 
 
 def load_spec(robot: Robot) -> mujoco.MjSpec:
-    """Read the MJCF from the package that ships it, or raise `MissingExtraError`; importing that would be slow."""
+    """Read the MJCF from the package that ships it, without its slow import, or raise `MissingExtraError`."""
     package, path = robot.mjcf
     module = importlib.util.find_spec(package)
     if module is None or module.origin is None:
@@ -155,7 +130,7 @@ def load_spec(robot: Robot) -> mujoco.MjSpec:
 
 
 def compile_spec(spec: mujoco.MjSpec) -> mujoco.MjModel:
-    """Compile a model; the attribute `settotalmass`, deprecated with a warning, is replaced as MuJoCo asks."""
+    """Compile a model; replace the deprecated attribute `settotalmass` as MuJoCo recommends."""
     total_mass, spec.compiler.settotalmass = spec.compiler.settotalmass, -1
     model = spec.compile()
     if total_mass > 0:

@@ -1,4 +1,4 @@
-"""The one place for what MJX and Brax do and this project does not: loose promotion, and idle notes."""
+"""The setting of calls into MJX and Brax: loose promotion, and no idle notes."""
 
 import contextlib
 import io
@@ -18,8 +18,7 @@ _NOTES = (
 def third_party() -> Iterator[None]:
     """Import or call MJX or Brax: promote dtypes and ranks as JAX does by default, and hide idle notes.
 
-    MJX prints at its import that the optional Warp is not installed, and Warp, where it is, greets; therefore what is
-    written to standard output is dropped.
+    Standard output is discarded: MJX prints at its import that the optional Warp is not installed, and Warp a greeting.
     """
     with (
         jax.numpy_dtype_promotion("standard"),

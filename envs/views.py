@@ -1,4 +1,4 @@
-"""Views of a symmetric body: the same motion, as another of its sides would see it."""
+"""Views of a symmetric body: the same motion from another of its sides."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -23,25 +23,25 @@ class Views(struct.PyTreeNode):
         return self.obs_order.shape[-2]
 
     def obs(self, view: Int[Array, ""], obs: Float[Array, "*batch P"]) -> Float[Array, "*batch P"]:
-        """Return proprioceptive slices as seen in a view."""
+        """Return proprioceptive slices in a view."""
         return obs[..., self.obs_order[view]] * jnp.broadcast_to(self.obs_sign[view], obs.shape)
 
     def action(self, view: Int[Array, ""], action: Float[Array, "*batch A"]) -> Float[Array, "*batch A"]:
-        """Return actions as seen in a view."""
+        """Return actions in a view."""
         return action[..., self.action_order[view]] * jnp.broadcast_to(self.action_sign[view], action.shape)
 
 
-Signed = tuple[tuple[int, int], ...]
-"""For each entry the index of the one that takes its place, and its sign."""
+Signed = tuple[tuple[int, int], ...]  # For each entry the index of the one that takes its place, and its sign.
 
 
 def one_view(obs_size: int, action_size: int) -> Views:
     """Return the view of a body that looks different from every side."""
-    return make_views(tuple((i, 1) for i in range(obs_size)), tuple((i, 1) for i in range(action_size)), 1)
+    obs, action = (tuple((i, 1) for i in range(size)) for size in (obs_size, action_size))
+    return make_views(obs, action, 1)
 
 
 def make_views(obs: Signed, action: Signed, count: int) -> Views:
-    """Return `count` views, each a turn further than the one before."""
+    """Return `count` views, each one turn after the previous."""
     arrays = []
     for turn in (obs, action):
         order, sign = (np.array(column) for column in zip(*turn, strict=True))

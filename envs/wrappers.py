@@ -14,7 +14,7 @@ from taic_jax.envs.views import Views
 
 
 class Wrapper(Env):
-    """An environment around another; all that it does not define is the inner one's."""
+    """An environment around another, with the inner one's attributes and methods."""
 
     def __init__(self, env: Env):
         self.env = env
@@ -31,25 +31,21 @@ class Wrapper(Env):
 
     @property
     def evaluated(self) -> Env:
-        """This wrapper, with its own settings, around the inner environment as evaluation sets it."""
+        """This wrapper, with its own settings, around the inner environment's `evaluated`."""
         wrapper = copy.copy(self)
         wrapper.env = self.env.evaluated
         return wrapper
 
     def reset(self, key: Key[Array, ""]) -> State:
-        """Reset the inner environment."""
         return self.env.reset(key)
 
     def restart(self, key: Key[Array, ""], ended: Any) -> State:
-        """Restart the inner environment."""
         return self.env.restart(key, ended)
 
     def step(self, state: State, action: Float[Array, " A"]) -> State:
-        """Step the inner environment."""
         return self.env.step(state, action)
 
     def render(self, physics: Any, *, height: int = 240, width: int = 320) -> np.ndarray:
-        """Render with the inner environment."""
         return self.env.render(physics, height=height, width=width)
 
 
@@ -71,7 +67,7 @@ class TimeLimit(Wrapper):
     def step(self, state: State, action: Float[Array, " A"]) -> State:
         """Step and count the tick."""
         tick = state.tick + 1
-        no = jnp.zeros((), bool)  # for a task that leaves them as they were
+        no = jnp.zeros((), bool)  # for a task that does not set them
         state = self.env.step(state.replace(terminated=no, truncated=no), action)
         return state.replace(tick=tick, truncated=state.truncated | (tick >= self.episode_length))
 
@@ -79,9 +75,8 @@ class TimeLimit(Wrapper):
 class AutoReset(Wrapper):
     """Start the next episode, from a fresh key, in the tick that ends one.
 
-    That tick's reward, terminated, truncated and metrics stay, and `final_obs` is the observation it ended in;
-    physics, obs and tick are already the next episode's. Ticks in which no episode of the whole batch ends compute
-    no reset, under any nesting of vmap.
+    That tick's reward, terminated, truncated and metrics stay, and `final_obs` is its observation; physics, obs and
+    tick are the next episode's. If no episode of the whole batch ends, no reset is computed, under any nesting of vmap.
     """
 
     def reset(self, key: Key[Array, ""]) -> State:
@@ -91,7 +86,7 @@ class AutoReset(Wrapper):
         return state.replace(key=key, final_obs=state.obs)
 
     def step(self, state: State, action: Float[Array, " A"]) -> State:
-        """Step, then reset where the episode ended."""
+        """Step, and start the next episode if this one ends."""
         key, key_reset = jax.random.split(state.key)
         state = self.env.step(state, action)
         running = (state.physics, state.obs, state.tick)
@@ -105,7 +100,7 @@ class AutoReset(Wrapper):
         return restart(*args)
 
     def _restart_ended(self, ended: Array, key: Array, running: Any) -> Any:
-        """Put a fresh start where an episode ended; all arguments have the leading axes of `ended`."""
+        """Replace each state at an episode's end by a fresh start; all arguments have the leading axes of `ended`."""
 
         def restart(ended: Array, key: Array, running: Any) -> Any:
             start = self.env.restart(key, running[0])

@@ -1,4 +1,4 @@
-"""Doors between libraries: others' environments behind `Env`, and ours for theirs; each is loaded when used."""
+"""Adapters between libraries: their environments behind `Env`, and ours for them; each is imported at its first use."""
 
 from typing import TYPE_CHECKING
 
@@ -20,11 +20,10 @@ __all__ = [
 def to_brax(env: Env) -> "BraxExport":
     """Turn an environment of ours into a `brax.envs.Env`, for Brax's wrappers and trainers.
 
-    Brax counts the ticks, in its `EpisodeWrapper`, so a `TimeLimit` around `env` is taken off; its number is
-    still there as `episode_length`, to be passed on: `training.wrap(to_brax(env), env.episode_length)`. At an
-    episode's end Brax goes back to the copy's first state, so starts do not vary, nor does a task's `restart` act.
-    With JAX 0.10, Brax 0.14.2's PPO stops, for any environment, at a function that JAX took away
-    (`device_put_replicated`); its wrappers work.
+    Brax counts the ticks, in its `EpisodeWrapper`: a `TimeLimit` around `env` is removed, and its number stays as
+    `episode_length`: `training.wrap(to_brax(env), env.episode_length)`. At an episode's end Brax goes back to the
+    copy's first state: starts do not vary, and a task's `restart` has no effect. With JAX 0.10, Brax 0.14.2's PPO
+    stops, for any environment, at a function that JAX no longer has (`device_put_replicated`); its wrappers work.
 
     Raises:
       AdapterError: `env` is none of ours, resets itself, or has its time limit inside another wrapper.
@@ -36,13 +35,9 @@ def to_brax(env: Env) -> "BraxExport":
 
 
 def to_gymnasium(env: Env, render_mode: str | None = None) -> "GymnasiumExport":
-    """Turn an environment of ours into a `gymnasium.Env`: NumPy in and out, compiled, info holding the metrics.
+    """Turn an environment of ours into a `gymnasium.Env`: NumPy in and out, compiled, with the metrics as info.
 
-    `truncated` comes from the `TimeLimit` that `make_env` puts around a task.
-
-    Args:
-      env: an environment of ours.
-      render_mode: `rgb_array`, or None for no pictures.
+    `truncated` comes from the `TimeLimit` that `make_env` puts around a task. `render_mode` is `rgb_array` or None.
 
     Raises:
       MissingExtraError: Gymnasium is not installed.
@@ -59,14 +54,8 @@ def to_gymnasium_vector(env: Env, num_envs: int, render_mode: str | None = None)
     """Turn an environment of ours into a `gymnasium.vector.VectorEnv` of N copies in one compiled program.
 
     An episode that ends is followed by the next in the same tick (`AutoresetMode.SAME_STEP`): obs is the next
-    episode's first, and infos hold the last one's `final_obs` and, as `final_info`, its metrics. Arguments and
-    errors are those of `to_gymnasium`, besides:
-
-    Args:
-      num_envs: N, at least 1.
-
-    Raises:
-      AdapterError: `num_envs` is not a positive integer.
+    episode's first, and infos hold the last one's `final_obs` and, as `final_info`, its metrics. Errors are those of
+    `to_gymnasium`, and `AdapterError` if N is not a positive integer.
     """
     with extra("gym"):
         from taic_jax.envs.adapters.gymnasium_export import GymnasiumVectorExport

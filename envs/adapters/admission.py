@@ -1,4 +1,4 @@
-"""Conditions on an environment that passes an adapter, each refused in one line."""
+"""Conditions on an environment for an adapter, each with its error in one line."""
 
 import contextlib
 from collections.abc import Iterator
@@ -14,7 +14,7 @@ from taic_jax.envs.errors import AdapterError, MissingExtraError
 
 @contextlib.contextmanager
 def extra(name: str) -> Iterator[None]:
-    """Import packages of an extra of ours; `MissingExtraError` with the line that installs it where one is missing."""
+    """Import packages of an extra of ours; `MissingExtraError` if one is missing."""
     try:
         yield
     except ModuleNotFoundError as error:
@@ -22,9 +22,9 @@ def extra(name: str) -> Iterator[None]:
 
 
 def require_vector_actions(name: str, env: Any, limits: Float[np.ndarray, "A 2"] | None = None) -> None:
-    """Raise `AdapterError` at actions that a vector in [-1, 1]^A cannot stand for: discrete, composite or unlimited.
+    """Raise `AdapterError` at actions that are no vector in [-1, 1]^A: discrete, composite or unlimited.
 
-    `limits` are low and high of every action; without them, those of the environment's `action_space` are read.
+    `limits` are low and high of every action; without them, those of the environment's `action_space`.
     """
     space: Any = getattr(env, "action_space", None)
     if any(hasattr(space, attribute) for attribute in ("n", "nvec", "spaces")):
@@ -38,9 +38,9 @@ def require_vector_actions(name: str, env: Any, limits: Float[np.ndarray, "A 2"]
 
 
 def require_task(adapter: str, env: Any) -> State:
-    """Return the abstract first state of one of our environments that shall leave through an adapter.
+    """Return the abstract first state of an environment for another library.
 
-    Raise `AdapterError` if it is none of ours, or starts the next episode by itself, which the other side does.
+    Raise `AdapterError` if it is none of ours, or resets itself, which the other library does.
     """
     require_vector_actions(adapter, env)
     if not isinstance(env, Env):

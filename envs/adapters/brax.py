@@ -14,22 +14,18 @@ BRAX_PIPELINES = ("spring", "positional", "generalized", "mjx")
 
 
 class BraxEnv(ForeignEnv):
-    """Any environment registered with Brax; its `done` is our `terminated`, and the time limit is ours.
-
-    Args:
-      name: as registered with Brax, without prefix.
-      pipeline: Brax's physics.
+    """The environment registered with Brax under a name, without prefix, on one of Brax's pipelines.
 
     Raises:
-      UnknownNameError: if there is no such environment or pipeline.
-      AdapterError: if Brax refuses the pipeline, the observation is not one vector, or actions have no limits.
+      UnknownNameError: there is no such environment or pipeline.
+      AdapterError: Brax refuses the pipeline, the observation is not one vector, or actions have no limits.
     """
 
     episode_length = 1000  # ticks
 
     def __init__(self, name: str, pipeline: str = "spring"):
         with third_party():
-            from brax import envs as brax_envs  # takes seconds, so only those who want Brax wait
+            from brax import envs as brax_envs  # its import takes seconds
 
         if name not in brax_envs._envs:
             raise UnknownNameError("environment", BRAX_PREFIX + name, [BRAX_PREFIX + each for each in brax_envs._envs])

@@ -26,17 +26,14 @@ class BraxExport(base.Env):
 
     def __init__(self, env: Env):
         require_task("to_brax", env)
-        self.episode_length = env.episode_length  # ticks
-        self.dt = env.dt
+        self.episode_length, self.dt = env.episode_length, env.dt
         while isinstance(env, TimeLimit):
             env = env.env
         start = require_task("to_brax", env)
         if start.tick is not None:
-            raise AdapterError(
-                f"to_brax: {env.name} has its TimeLimit inside {type(env).__name__}, expected it outside"
-            )
-        self.env = env
-        self._metrics = tuple(start.metrics)
+            inner = f"{env.name} has its TimeLimit inside {type(env).__name__}"
+            raise AdapterError(f"to_brax: {inner}, expected it outside")
+        self.env, self._metrics = env, tuple(start.metrics)
 
     def reset(self, rng: Array) -> base.State:
         """Reset under one of Brax's raw keys [2] uint32, or under a typed one."""
@@ -45,15 +42,10 @@ class BraxExport(base.Env):
         return base.State(**_fields(state), metrics=dict(state.metrics), info={})
 
     def step(self, state: Any, action: Array) -> base.State:
-        """Step; what Brax's wrappers have put into metrics and info stays there."""
-        before = State(
-            physics=state.pipeline_state,
-            obs=state.obs,
-            reward=state.reward,
-            terminated=state.done.astype(bool),
-            truncated=jnp.zeros((), bool),
-            metrics={name: state.metrics[name] for name in self._metrics},
-        )
+        """Step; the entries of Brax's wrappers in metrics and info stay."""
+        metrics = {name: state.metrics[name] for name in self._metrics}
+        flags = {"terminated": state.done.astype(bool), "truncated": jnp.zeros((), bool)}
+        before = State(state.pipeline_state, state.obs, state.reward, **flags, metrics=metrics)
         after = self.env.step(before, jnp.clip(action, -1.0, 1.0))
         return state.replace(**_fields(after), metrics={**state.metrics, **after.metrics})
 

@@ -1,4 +1,4 @@
-"""Environments of libraries with Brax's interface behind `Env`: pure functions of a state that says `done`."""
+"""Environments of libraries with Brax's interface behind `Env`: pure functions of a state with `done`."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -17,7 +17,7 @@ from taic_jax.envs.third_party import third_party
 
 
 class ForeignPhysics(struct.PyTreeNode):
-    """The parts of the library's state that outlive a tick and that our `State` does not hold itself."""
+    """The parts of the library's state that outlive a tick and have no field in our `State`."""
 
     simulation: Any
     info: dict[str, Any]
@@ -75,17 +75,14 @@ class ForeignEnv(Env):
     def _from_library(self, state: Any) -> State:
         parts = dict(state.obs) if self._in_parts else {"state": state.obs}
         obs = parts.pop("state")
-        return State(
-            physics=_strong(ForeignPhysics(getattr(state, self._simulation), state.info, parts)),
-            obs=jnp.asarray(obs, jnp.float32),
-            reward=jnp.asarray(state.reward, jnp.float32),
-            terminated=jnp.asarray(state.done, bool),
-            truncated=jnp.zeros((), bool),
-            metrics={name: jnp.asarray(value, jnp.float32) for name, value in state.metrics.items()},
-        )
+        physics = jax.tree.map(_strong, ForeignPhysics(getattr(state, self._simulation), state.info, parts))
+        obs, reward = jnp.asarray(obs, jnp.float32), jnp.asarray(state.reward, jnp.float32)
+        metrics = {name: jnp.asarray(value, jnp.float32) for name, value in state.metrics.items()}
+        flags = {"terminated": jnp.asarray(state.done, bool), "truncated": jnp.zeros((), bool)}
+        return State(physics, obs, reward, **flags, metrics=metrics)
 
 
-def _strong(tree: Any) -> Any:
-    """Make every dtype strong, for a carry that is the same after reset and step."""
-    arrays = jax.tree.map(jnp.asarray, tree)
-    return jax.tree.map(lambda leaf: jax.lax.convert_element_type(leaf, leaf.dtype), arrays)
+def _strong(leaf: Any) -> Array:
+    """Return an array of strong dtype, so that reset and step return the same types."""
+    array = jnp.asarray(leaf)
+    return jax.lax.convert_element_type(array, array.dtype)

@@ -19,19 +19,16 @@ PLAYGROUND_PREFIX = "playground:"
 
 
 class PlaygroundEnv(ForeignEnv):
-    """An environment of MuJoCo Playground; its `done` is our `terminated`, and the time limit is ours.
+    """The environment registered with MuJoCo Playground under a name, without prefix.
 
-    Of an observation in parts, the one named "state" is taken. Physics is MJX's in JAX, also where Playground
-    would choose Warp, and an action is applied for one step, whatever `action_repeat` its configuration holds.
-
-    Args:
-      name: as registered with Playground, without prefix.
+    Physics is MJX's in JAX, also where Playground would choose Warp, and an action is applied for one step, at any
+    `action_repeat`.
 
     Raises:
       MissingExtraError: Playground is not installed.
-      UnknownNameError: if there is no such environment.
-      AdapterError: if it needs models that are not on this machine, which are never downloaded, its observation
-        is not one vector, or actions have no limits.
+      UnknownNameError: there is no such environment.
+      AdapterError: it needs models that are not on this machine, which are never downloaded, its observation is not one
+        vector, or actions have no limits.
     """
 
     def __init__(self, name: str):
@@ -40,9 +37,8 @@ class PlaygroundEnv(ForeignEnv):
         suites = (registry.dm_control_suite, registry.locomotion, registry.manipulation)
         names = [each for suite in suites for each in suite.ALL_ENVS]
         if name not in names:
-            raise UnknownNameError(
-                "environment", PLAYGROUND_PREFIX + name, [PLAYGROUND_PREFIX + each for each in names]
-            )
+            valid = [PLAYGROUND_PREFIX + each for each in names]
+            raise UnknownNameError("environment", PLAYGROUND_PREFIX + name, valid)
         if name not in registry.dm_control_suite.ALL_ENVS:
             _require_menagerie(PLAYGROUND_PREFIX + name, registry.mjx_env)
         config = registry.get_default_config(name)
@@ -54,13 +50,13 @@ class PlaygroundEnv(ForeignEnv):
         super().__init__(PLAYGROUND_PREFIX + name, inner, "data", limits)
 
     def render(self, physics: ForeignPhysics, *, height: int = 240, width: int = 320) -> np.ndarray:
-        """Draw with MuJoCo's renderer, from qpos and from where the targets (mocap bodies) are."""
+        """Draw with MuJoCo's renderer, from qpos and the places of the targets (mocap bodies)."""
         model, data = self.inner.mj_model, physics.simulation
         qpos, mocap = np.asarray(data.qpos), np.asarray(data.mocap_pos)
         bounds = np.flatnonzero((mocap[1:] != mocap[:-1]).any(axis=(1, 2))) + 1
         frames = []
         for start, stop in zip([0, *bounds], [*bounds, len(qpos)], strict=True):
-            scene = copy.copy(model)  # a mocap body is drawn where the model puts it
+            scene = copy.copy(model)  # a mocap body is drawn at its place in the model
             scene.body_pos[scene.body_mocapid >= 0] = mocap[start][scene.body_mocapid[scene.body_mocapid >= 0]]
             frames.append(render_mujoco(scene, qpos[start:stop], height=height, width=width))
         return np.concatenate(frames)
@@ -70,7 +66,7 @@ class PlaygroundEnv(ForeignEnv):
 
 
 def _require_menagerie(name: str, mjx_env: Any) -> None:
-    """Stop before Playground would clone its robots from the network."""
+    """Raise `AdapterError` before Playground clones its robots from the network."""
     if not mjx_env.MENAGERIE_PATH.exists():
         raise AdapterError(
             f"{name}: needs the robots of github.com/google-deepmind/mujoco_menagerie, expected commit "

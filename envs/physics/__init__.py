@@ -13,28 +13,22 @@ BACKENDS = ("auto", "mujoco", "mjx", "warp")
 
 
 def make_physics(
-    model: MjModel,
-    substeps: int,
-    backend: str = "auto",
-    num_threads: int = 0,
-    *,
-    iterations: int | None = None,
-    ls_iterations: int | None = None,
-) -> Physics:
+    model: MjModel, substeps: int, backend: str = "auto", num_threads: int = 0,
+    *, iterations: int | None = None, ls_iterations: int | None = None,
+) -> Physics:  # fmt: skip
     """Load a model on a backend.
 
     Args:
-      model: compiled model.
       substeps: engine steps a tick.
       backend: `mujoco` (C engine, host's cores), `mjx` (JAX), `warp` (MJX on MuJoCo Warp, NVIDIA only), or `auto`:
-        `mujoco` where JAX runs on CPU, else `mjx`.
-      num_threads: threads of the `mujoco` backend; 0 shares the physical cores between JAX's devices.
-      iterations: solver iterations on `mjx` and `warp`, None for the model's own.
-      ls_iterations: line-search iterations likewise.
+        `mujoco` if JAX runs on CPU, else `mjx`.
+      num_threads: of the `mujoco` backend; 0 shares the physical cores between JAX's devices.
+      iterations, ls_iterations: of solver and line search on `mjx` and `warp`; None for the model's own.
 
     Raises:
-      UnknownNameError: if there is no such backend.
-      MissingExtraError: if the backend needs a package or a device that is not there.
+      UnknownNameError: there is no such backend.
+      MissingExtraError: the backend's package is not installed.
+      BackendError: the backend's device is missing.
     """
     if backend not in BACKENDS:
         raise UnknownNameError("backend", backend, BACKENDS)

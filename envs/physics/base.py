@@ -11,16 +11,10 @@ from taic_jax.envs.base import PhysicsState
 
 
 class Physics(abc.ABC):
-    """A model's dynamics as a pure, unbatched function of a small state.
-
-    Args:
-      model: compiled model.
-      substeps: engine steps a tick.
-    """
+    """A model's dynamics as a pure, unbatched function of a small state; a tick has `substeps` engine steps."""
 
     def __init__(self, model: mujoco.MjModel, substeps: int):
-        self.model = model
-        self.substeps = substeps
+        self.model, self.substeps = model, substeps
 
     def init(self, qpos: Float[Array, " nq"], qvel: Float[Array, " nv"]) -> PhysicsState:
         """Make the state from which an episode starts; needs no forward pass."""

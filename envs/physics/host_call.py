@@ -1,9 +1,9 @@
 """Calls from compiled programs into Python on the host, by a name that stays the same from process to process.
 
-JAX's own callbacks are baked into a program as an address, so no program with one can stay in the persistent
-compilation cache. Here a function is a handler of XLA's foreign function interface. Its C structures (those of
-`xla/ffi/api/c_api.h`, extended only at their ends) are read by ctypes, as words: nothing needs to be compiled. A
-handler names the version at which they were read, and XLA refuses one whose version it no longer serves.
+JAX's own callbacks are an address in the program, so that no program with one can stay in the persistent compilation
+cache. Here a function is a handler of XLA's foreign function interface. ctypes reads its C structures (those of
+`xla/ffi/api/c_api.h`, extended only at their ends) as words, without compilation. A handler states the version of these
+structures, and XLA refuses a version that it no longer serves.
 """
 
 import ctypes
@@ -18,10 +18,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 HostFn = Callable[[np.ndarray, np.ndarray], None]
-"""Reads its first argument, writes its second; both are float32 and XLA's own memory."""
-
-API_VERSION = (0, 1)
-"""Major and minor version of XLA's interface that the places below belong to. 0.3 still has them; XLA serves both."""
+"""A function that reads its first argument and writes its second; both are float32 and XLA's own memory."""
+API_VERSION = (0, 1)  # Of XLA's interface with the places below: major and minor. 0.3 still has them; XLA serves both.
 
 # Places of words in XLA_FFI_CallFrame, XLA_FFI_Api, XLA_FFI_Extension_Base, XLA_FFI_Metadata and XLA_FFI_Buffer.
 _EXTENSION, _API, _ARGUMENTS, _RESULTS = 1, 2, 9, 14
@@ -29,19 +27,17 @@ _CREATE_ERROR = 6
 _EXTENSION_TYPE, _EXTENDED, _METADATA_VERSION = 1, 3, 3
 _DATA, _RANK, _DIMS = 3, 4, 5
 _METADATA, _INTERNAL = 1, 13  # codes of an extension and of an error
-
 _REFUSAL = "a negative number, or another shape"
-
 _Handler = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)
 
 
 class HostCall:
-    """A function on the host that compiled programs on the CPU call by its name; keep it for as long as they live.
+    """A function on the host that compiled programs on the CPU call by its name; it must live as long as they do.
 
     Args:
-      name: not used before in this process. Programs in the persistent cache look for it, so it must name all that
-        the function does.
-      function: called maybe from several threads at once. It must not call JAX, which can deadlock.
+      name: unique in this process. Programs in the persistent cache refer to it, so it must identify all that the
+        function does.
+      function: several threads may call it at once. It must not call JAX, which can deadlock.
 
     Raises:
       RuntimeError: XLA no longer serves `API_VERSION`.
@@ -75,10 +71,8 @@ class HostCall:
 
 @functools.cache
 def host_calls_work() -> bool:
-    """Return whether XLA calls the host as this module expects, with a line on standard error where it does not.
-
-    Try one call whose answer is certain and one that must fail.
-    """
+    """Return whether XLA calls the host as this module expects, by one call with a certain answer and one that must
+    fail; print a line on standard error if it does not."""
     try:
         cpu, *_ = jax.local_devices(backend="cpu")
     except RuntimeError:  # without a CPU device no program asks for host calls

@@ -24,41 +24,28 @@ _WARP_CAPACITY = {"naconmax": 32 * 8192, "njmax": 200}
 class MjxPhysics(Physics):
     """Steps of MJX on a template `mjx.Data`, of which only `PhysicsState` and the controls change.
 
-    Fewer solver iterations are faster and soon wrong: with a single one, the ant's joint velocities are off by
-    10 rad/s within a tick. Of the line search, 4 iterations change nothing measurable. For the arguments see
-    `make_physics`.
-
-    Raises:
-      MissingExtraError: for `warp`, its package is not installed or JAX has no NVIDIA device.
+    Fewer solver iterations are faster and soon wrong: with one, the ant's joint velocities are off by 10 rad/s within a
+    tick. Of the line search, 4 iterations change nothing measurable. For arguments and errors see `make_physics`.
     """
 
     def __init__(
-        self,
-        model: mujoco.MjModel,
-        substeps: int,
-        iterations: int | None = None,
-        ls_iterations: int | None = None,
-        *,
-        warp: bool = False,
-    ):
+        self, model: mujoco.MjModel, substeps: int, iterations: int | None = None, ls_iterations: int | None = None,
+        *, warp: bool = False,
+    ):  # fmt: skip
         if warp:
             _require_warp()
         super().__init__(model, substeps)
         impl = "warp" if warp else "jax"
         with third_party():
             mjx_model = mjx.put_model(model, impl=impl)
-            option = mjx_model.opt.replace(
-                iterations=iterations or mjx_model.opt.iterations,
-                ls_iterations=ls_iterations or mjx_model.opt.ls_iterations,
-            )
+            settings = {"iterations": iterations, "ls_iterations": ls_iterations}
+            option = mjx_model.opt.replace(**{name: value for name, value in settings.items() if value})
             if warp:  # or each step that takes all its iterations prints a line for every simulation
                 option = option.tree_replace({"_impl.warn_overflow": 0})
             self._model = mjx_model.replace(opt=option)
             self._data = mjx.make_data(model, impl=impl, **(_WARP_CAPACITY if warp else {}))
 
     def step(self, state: PhysicsState, ctrl: Float[Array, " nu"]) -> PhysicsState:
-        """Advance by one tick under constant controls."""
-
         def substep(state: PhysicsState, _: None) -> tuple[PhysicsState, None]:
             data = self._data.replace(qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.qacc_warmstart, ctrl=ctrl)
             data = mjx.step(self._model, data)

@@ -25,7 +25,7 @@ _SENT = sum(x.value for x in (_STATE.mjSTATE_QPOS, _STATE.mjSTATE_QVEL, _STATE.m
 # After these warnings MuJoCo has put the simulation back to its initial pose.
 _DIVERGED = [x.value for x in (_WARNING.mjWARN_BADQPOS, _WARNING.mjWARN_BADQVEL, _WARNING.mjWARN_BADQACC)]
 PATIENCE = 60.0
-"""Seconds after which a call that has not returned is reported; the longest of ours take a tenth of one."""
+"""Seconds after which a call that has not returned is reported; our longest calls take a tenth of a second."""
 LATE = (
     f"the physics has not returned for {PATIENCE:.0f} s. If it never does: end the process (kill -9), go on from the "
     "last checkpoint (--resume), and should it happen again, step with one thread (--env.num-threads 1)"
@@ -35,14 +35,13 @@ LATE = (
 class MujocoPhysics(Physics):
     """A host call of `mujoco.batch.Batch`; all leading axes (seeds, environments) are one engine call.
 
-    It is pure: the engine's own memory between calls is scratch. Each call overwrites every state field that
-    `mj_step` reads (qpos, qvel, qacc_warmstart, ctrl). The others never change: models with activations,
-    mocap bodies, plugins or equalities are refused, no forces are applied, and the time enters no force. So
-    the result depends on the arguments alone, at any number of threads. A simulation that diverges comes back
-    as NaN. Later changes of the model have no effect. For the arguments see `make_physics`.
+    It is pure: the result depends on the arguments alone, at any number of threads. Each call overwrites every state
+    field that `mj_step` reads (qpos, qvel, qacc_warmstart, ctrl). The others never change: models with activations,
+    mocap bodies, plugins or equalities are refused, no forces are applied, and the time enters no force. A simulation
+    that diverges returns NaN. Later changes of the model have no effect. For arguments see `make_physics`.
 
     Raises:
-      ValueError: if the model has state that `PhysicsState` does not carry.
+      ValueError: the model has state that is not in `PhysicsState`.
     """
 
     def __init__(self, model: mujoco.MjModel, substeps: int, num_threads: int = 0):
@@ -55,23 +54,22 @@ class MujocoPhysics(Physics):
         self.engine = _engine(saved.tobytes(), substeps, self.num_threads)
 
     def step(self, state: PhysicsState, ctrl: Float[Array, " nu"]) -> PhysicsState:
-        """Advance by one tick under constant controls."""
         nq, nv = self.model.nq, self.model.nv
         sent = jnp.concatenate([state.qpos, state.qvel, state.qacc_warmstart, ctrl])
         # `pure_callback` serves accelerators and an XLA that refuses our host calls. On CPU it takes ten times as long
-        # to hand arrays over as a host call, which steps in XLA's own memory.
-        shape = jax.ShapeDtypeStruct((self.engine.num_returned,), jnp.float32)
+        # to pass arrays as a host call, which steps in XLA's own memory.
+        call, size = self.engine.call, self.engine.num_returned
+        shape = jax.ShapeDtypeStruct((size,), jnp.float32)
         elsewhere = functools.partial(jax.pure_callback, self.engine.copied_step, shape, vmap_method="broadcast_all")
-        call = self.engine.call
-        here = elsewhere if call is None else functools.partial(call, size=self.engine.num_returned)
+        here = elsewhere if call is None else functools.partial(call, size=size)
         after = jax.lax.platform_dependent(sent, cpu=here, default=elsewhere)
         return state.replace(qpos=after[:nq], qvel=after[nq : nq + nv], qacc_warmstart=after[nq + nv :])
 
 
 class Engine:
-    """Steps of a model's simulations on the host: any number in one call, and calls from any number of threads.
+    """Steps of a model's simulations on the host, any number in one call, from any number of threads.
 
-    No other engine's host call has its name, and nothing else changes its model.
+    The name is of this engine's host call alone, and nothing else changes its model.
     """
 
     def __init__(self, name: str, model: mujoco.MjModel, substeps: int, num_threads: int):
@@ -117,7 +115,7 @@ def _engine(model: bytes, substeps: int, num_threads: int) -> Engine:
 
 
 def num_physical_cores() -> int:
-    """Count the physical cores this process may use; the hyperthreads of a core count once."""
+    """Count the physical cores of this process; the hyperthreads of a core count once."""
     if not hasattr(os, "sched_getaffinity"):
         return psutil.cpu_count(logical=False) or 1
     cores = set()

@@ -1,4 +1,4 @@
-"""Say so when a call into the engine does not return, instead of hanging in silence."""
+"""Report a call into the engine that does not return, instead of a silent hang."""
 
 import sys
 import threading
@@ -7,10 +7,9 @@ import weakref
 
 
 class Watchdog:
-    """A context around calls; one that takes longer than `limit` seconds gets `message` on standard error, once.
+    """A context around calls from any threads; one of more than `limit` seconds gets `message` on standard error, once.
 
-    Several threads may be in it. One more looks on from the first call until the watchdog is no longer used. It costs a
-    call two assignments.
+    A thread of its own watches from the first call until the watchdog is garbage. It costs a call two assignments.
     """
 
     def __init__(self, limit: float, message: str):
@@ -21,14 +20,14 @@ class Watchdog:
     def __enter__(self) -> None:
         self._since[threading.get_ident()] = time.monotonic()
         if self._thread is None:
-            self._thread = threading.Thread(target=_look_on, args=(weakref.ref(self), self.limit / 4), daemon=True)
+            self._thread = threading.Thread(target=_watch, args=(weakref.ref(self), self.limit / 4), daemon=True)
             self._thread.start()
 
     def __exit__(self, *_: object) -> None:
         del self._since[threading.get_ident()]
 
     def late(self, reported: float | None) -> float | None:
-        """Return when the longest running call began if it is late; report it too, unless that is `reported`."""
+        """Return the start of the longest running call if it is late, and report it unless that is `reported`."""
         since = min(self._since.copy().values(), default=None)
         if since is None or time.monotonic() - since < self.limit:
             return None
@@ -37,12 +36,12 @@ class Watchdog:
         return since
 
 
-def _look_on(watchdog: "weakref.ref[Watchdog]", interval: float) -> None:
+def _watch(watchdog: "weakref.ref[Watchdog]", interval: float) -> None:
     reported = None
     while True:
         time.sleep(interval)
-        watched = watchdog()
-        if watched is None:
+        alive = watchdog()
+        if alive is None:
             return
-        reported = watched.late(reported)
-        del watched  # or it would never be collected
+        reported = alive.late(reported)
+        del alive  # or it would never be collected

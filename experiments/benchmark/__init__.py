@@ -1,1 +1,1 @@
-"""The benchmark: ticks per second beside the bare engine and other libraries, and what the parts cost."""
+"""The benchmark: ticks per second beside the bare engine and other libraries, and the costs of the parts."""

@@ -26,7 +26,7 @@ C = TypeVar("C", bound=Command)
 
 
 def answer(kind: type[C], measure: Callable[[C], Any], args: Sequence[str] | None = None) -> int:
-    """Measure what the arguments ask for, write the figures, and return the exit code, 2 for a mistake of the user."""
+    """Parse the arguments, measure, write the figures, and return the exit code, 2 for a mistake of the user."""
     arguments = tyro.cli(kind, args=args)
 
     def execute() -> None:
@@ -41,7 +41,7 @@ def answer(kind: type[C], measure: Callable[[C], Any], args: Sequence[str] | Non
 
 
 def show(rows: Iterable[Row]) -> list[Row]:
-    """Print each row when it is there, under its names where those of the row before are others, and return all."""
+    """Print each row as it comes, under its names if they differ from those of the row before, and return all."""
     shown: list[Row] = []
     for row in rows:
         if not shown or list(row) != list(shown[-1]):
@@ -52,7 +52,7 @@ def show(rows: Iterable[Row]) -> list[Row]:
 
 
 def _print(names: Iterable[str], cells: Iterable[Any]) -> None:
-    """Print cells to the right of columns as wide as their names, the first one to the left."""
+    """Print cells right-aligned in columns as wide as their names, the first one left-aligned."""
     texts = [_text(cell).rjust(max(len(name), 9)) for name, cell in zip(names, cells, strict=True)]
     print("  ".join([f"{texts[0].strip():32}", *texts[1:]]).rstrip(), flush=True)
 

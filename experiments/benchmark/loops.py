@@ -1,9 +1,8 @@
 """The loops of ours that the benchmark measures: the engine alone, rollouts, and training, flat and over options.
 
-Each function returns the loop to call again and again; all that is called before is left out of the measurement.
+Each function returns a loop to call repeatedly; the work of the function itself is not measured.
 """
 
-import dataclasses
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -27,13 +26,10 @@ from taic_jax.types import as_arrays
 
 WORK = PPOConfig(num_envs=64, rollout_length=256, epochs=10, minibatch_size=512)
 """An iteration of training, everywhere here: 64 x 256 ticks, 10 epochs of 32 minibatches, 64x64 networks."""
-VARIABLE_LENGTH = 10
-"""The most ticks that options take which may end earlier: those of termination fixed are 5 ticks long."""
-EXPERIENCE = 16, 1024
-"""Environments, and ticks of each, that options are learnt from."""
+VARIABLE_LENGTH = 10  # The most ticks of an option that may end earlier; those of termination fixed are 5 ticks long.
+EXPERIENCE = 16, 1024  # Environments, and ticks of each, that options are learnt from.
 ONE_DEVICE = Devices()
-ITERATIONS = 100
-"""Of which one is measured; the step size decays over them."""
+ITERATIONS = 100  # Iterations over which the step size decays; one is measured.
 
 
 def has_engine(env: envs.Env) -> bool:
@@ -42,7 +38,7 @@ def has_engine(env: envs.Env) -> bool:
 
 
 def untrained_rollout(env: envs.Env, num_envs: int, length: int) -> Loop:
-    """Return a compiled rollout of `length` ticks with an untrained policy, which gives the carry and the ticks."""
+    """Return a compiled rollout of `length` ticks with an untrained policy; it returns the carry and the ticks."""
     executor, key = IdentityExecutor(env.action_size), jax.random.key(0)
     state = ppo.init(as_arrays(PPOConfig(num_envs=num_envs)), env, executor, key)
     decide = ppo.as_agent(PPOConfig(), executor, state).decide()
@@ -63,7 +59,7 @@ def stepping(
 ) -> Loop:
     """Return the task's own compiled loop: engine, rewards, time limit and automatic resets under these actions.
 
-    It gives the last state, and whatever is read of each state, the action there, and the state after.
+    It returns the last state, and `read` of each state, the action there, and the state after.
     """
     wrapped = envs.AutoReset(env)
     begin = jax.jit(jax.vmap(wrapped.reset))(jax.random.split(jax.random.key(0), actions.shape[1]))
@@ -78,10 +74,10 @@ def stepping(
 
 
 def bare_engine(env: envs.Env, actions: Float[Array, "T B A"]) -> Loop:
-    """Return a loop over `mujoco.batch` from NumPy that steps the very states which `stepping` steps.
+    """Return a loop over `mujoco.batch` from NumPy that steps the same states as `stepping`.
 
-    They are set at each tick: alone, robots that nothing resets soon lie on the ground or fall through it,
-    which costs the engine more or less than what it is compared with.
+    The states are set at each tick: robots that nothing resets soon lie on the ground or fall through it, at another
+    cost to the engine.
     """
 
     def sent(state: envs.State, action: Array, _: envs.State) -> Array:
@@ -101,7 +97,7 @@ def bare_engine(env: envs.Env, actions: Float[Array, "T B A"]) -> Loop:
 
 
 class Training:
-    """An iteration of PPO, compiled: rollout, advantages and all updates, of seeds side by side, split over devices."""
+    """A compiled iteration of PPO: rollout, advantages and all updates, of all seeds, split over devices."""
 
     def __init__(
         self, env: envs.Env, executor: Executor, config: PPOConfig, seeds: int = 1, devices: Devices = ONE_DEVICE
@@ -110,35 +106,32 @@ class Training:
         arrays, keys = as_arrays(config), jax.random.split(jax.random.key(0), seeds)
         init = partial(ppo.init, arrays, env, executor)
         iterate = partial(ppo.iterate, arrays, env, executor, ITERATIONS)
-        state = jax.jit(jax.vmap(init) if seeds > 1 else init)(keys if seeds > 1 else keys[0])
-        self.state = devices.place(state)
+        self.state = devices.place(jax.jit(jax.vmap(init))(keys) if seeds > 1 else jax.jit(init)(keys[0]))
         step = jax.vmap(lambda state: iterate(state)[:2]) if seeds > 1 else lambda state: iterate(state)[:2]
         self._step = devices.compile(step, self.state, donate=True)
 
     def __call__(self) -> None:
-        """Train for one iteration more than before."""
+        """Train for one iteration."""
         self.state, metrics = jax.block_until_ready(self._step(self.state))
         self.duration = float(jnp.mean(metrics["duration"]))
 
     @property
     def gradient_steps(self) -> int:
-        """How many gradient steps each seed has taken so far."""
+        """Gradient steps of each seed so far."""
         counts = [leaf for leaf in jax.tree.leaves(self.state.optimizer) if jnp.issubdtype(leaf.dtype, jnp.integer)]
         return int(counts[0].reshape(-1)[0])
 
 
 def untrained_ticks(env: envs.Env) -> Rollout:
-    """Return ticks [T, B] to learn options from: enough of each environment to hold a part of them out."""
+    """Return ticks [T, B] to learn options from: enough of each environment for a held-out part."""
     return untrained_rollout(env, *EXPERIENCE).run()[1]
 
 
 def executor_of(env: envs.Env, config: OptionsConfig | None, ticks: Rollout | None = None) -> Executor:
-    """Return options learnt from ticks of an untrained policy: how good they are changes no speed, how long does.
+    """Return options learnt from ticks of an untrained policy, or actions themselves without a config.
 
-    Without a config, return actions themselves.
-
-    Raises:
-      ShortExperienceError: delta is a quantile, and the ticks are too few to hold a part of them out.
+    The options' duration changes the speed, their quality does not. Raise `ShortExperienceError` if delta is a
+    quantile, and the ticks are too few for a held-out part.
     """
     if config is None:
         return IdentityExecutor(env.action_size)
@@ -151,4 +144,4 @@ def options_config(rule: str, decoder: str, steps: int, **changes: Any) -> Optio
     """Return the options of one termination rule and decoder."""
     length = {} if rule == "fixed" else {"length": VARIABLE_LENGTH}
     settings: dict[str, Any] = {"termination": rule, "decoder": decoder, "steps": steps} | length | changes
-    return dataclasses.replace(OptionsConfig(), **settings)
+    return OptionsConfig(**settings)

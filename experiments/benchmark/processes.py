@@ -1,4 +1,4 @@
-"""Measurements that take processes: starts with an empty and a filled cache, seeds over cores, a sweep run by run."""
+"""Measurements in processes: starts with an empty and a filled cache, seeds over cores, a sweep run by run."""
 
 import contextlib
 import multiprocessing
@@ -27,17 +27,13 @@ from taic_jax.runtime.program_cache import keep_programs
 from taic_jax.runtime.run_folder import RunFolder
 from taic_jax.types import as_arrays, as_rows
 
-PATIENCE = 600.0
-"""Seconds after which a run that has logged nothing is given up."""
+PATIENCE = 600.0  # Seconds after which a run that has logged nothing is stopped.
 POLL = 0.02
 
 
 def starts(task: str) -> dict[str, float]:
-    """Return the seconds to the next logged iteration: with no programs in the cache, with them, and resumed with them.
-
-    Raises:
-      RuntimeError: a run ended, or logged nothing.
-    """
+    """Return the seconds to the next logged iteration: with an empty cache, with a filled one, and resumed with that;
+    raise `RuntimeError` if a run ends or logs nothing."""
     with tempfile.TemporaryDirectory() as folder:
         cold, warm = Path(folder) / "cold-run", Path(folder) / "warm-run"
         runs = {"cold": (cold,), "warm": (warm,), "resumed": (warm, "--resume")}
@@ -45,15 +41,14 @@ def starts(task: str) -> dict[str, float]:
 
 
 def _next_iteration(task: str, folder: Path, run_dir: Path, *options: str) -> float:
-    """Start a run whose cache is in the folder, wait for the next row of its metrics, and stop it at a checkpoint."""
+    """Start a run whose cache is in the folder, stop it after the next row of its metrics, and return the seconds."""
     environment = {key: value for key, value in os.environ.items() if not key.startswith("JAX_COMPILATION_CACHE")}
     environment |= {"XDG_CACHE_HOME": str(folder / "cache")}
     command = [sys.executable, "-m", "taic_jax.run", task, "--run-dir", str(run_dir), *options]
-    run = RunFolder(run_dir)
-    before, begun = len(run.metrics()) if run.metrics_path.is_file() else 0, time.perf_counter()
+    before, begun = _rows(run_dir), time.perf_counter()
     with subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
         try:
-            while not run.metrics_path.is_file() or len(run.metrics()) <= before:
+            while _rows(run_dir) <= before:
                 if process.poll() is not None or time.perf_counter() - begun > PATIENCE:
                     raise RuntimeError(f"{' '.join(command)} logged nothing: exit code {process.poll()}")
                 time.sleep(POLL)
@@ -62,11 +57,16 @@ def _next_iteration(task: str, folder: Path, run_dir: Path, *options: str) -> fl
             process.terminate()
 
 
+def _rows(run_dir: Path) -> int:
+    run = RunFolder(run_dir)
+    return len(run.metrics()) if run.metrics_path.is_file() else 0
+
+
 class SeedsApart:
     """Training of K seeds in a process of its own, split over its devices as those of a run are: the cores of a CPU.
 
-    A process has its devices once and for all, and beside these loops one seed is to have all cores as one device.
-    There the task is made, and options are learnt first; without them, training is flat.
+    A process cannot change its devices, and the loops of one seed need all cores as one device. The other process makes
+    the task, and learns the options first; without options, training is flat.
     """
 
     def __init__(
@@ -76,15 +76,11 @@ class SeedsApart:
         self.ticks, self.duration = seeds * config.num_envs * config.rollout_length, 1.0
         self._pipe, theirs = context.Pipe()
         arguments = (theirs, make_env, config, seeds, options)
-        context.Process(target=_serve, args=arguments, daemon=True).start()  # which ends when this process does
+        context.Process(target=_serve, args=arguments, daemon=True).start()  # a daemon ends with this process
         theirs.close()
 
     def __call__(self) -> None:
-        """Train for one iteration more than before.
-
-        Raises:
-          RuntimeError: the process has failed.
-        """
+        """Train for one iteration; raise `RuntimeError` if the process has failed."""
         try:
             self._pipe.send(None)
             self.duration = self._pipe.recv()
@@ -95,7 +91,7 @@ class SeedsApart:
 def _serve(
     pipe: Connection, make_env: Callable[[], envs.Env], config: PPOConfig, seeds: int, options: OptionsConfig | None
 ) -> None:
-    """Train for an iteration whenever the other end asks, and reply how many ticks a decision took."""
+    """Train for an iteration at each message from the other end, and reply the ticks of a decision."""
     keep_programs()
     devices, env = Devices(open_devices("auto", seeds)), make_env()
     training = Training(env, executor_of(env, options), config, seeds, devices)
@@ -108,10 +104,7 @@ def _serve(
 
 @dataclass(frozen=True)
 class Sweep:
-    """A grid of step sizes, each with seeds, of flat training on one task.
-
-    Every way of running it does the same work: `points` x `seeds` runs of `ticks` ticks.
-    """
+    """A grid of step sizes, each with seeds, of flat training on one task: `points` x `seeds` runs of `ticks` ticks."""
 
     task: str
     points: int
@@ -120,7 +113,7 @@ class Sweep:
     config: PPOConfig
 
     def configs(self) -> list[PPOConfig]:
-        """Return the points, equally far apart in the logarithm."""
+        """Return the configs of the points, equally far apart in the logarithm of the step size."""
         return [replace(self.config, learning_rate=1e-4 * 100 ** (i / self.points)) for i in range(self.points)]
 
     def rows(self) -> tuple[PPOConfig, jax.Array]:
@@ -128,7 +121,7 @@ class Sweep:
         return as_rows(self.configs(), self.seeds), jax.random.split(jax.random.key(0), self.points * self.seeds)
 
     def train(self) -> Callable[[PPOConfig, jax.Array], jax.Array]:
-        """Return what does one run, and returns its curve."""
+        """Return the function that does one run and returns its curve."""
         env = envs.make_env(self.task)
         executor = IdentityExecutor(env.action_size)
         return lambda config, key: ppo.train(config, env, executor, key, self.ticks)[1]["return"]
@@ -137,9 +130,9 @@ class Sweep:
 def sweep_costs(sweep: Sweep, runs: int) -> dict[str, int | float]:
     """Return the seconds of a sweep in one program, in a loop over a compiled run, and in separate processes.
 
-    The first is measured whole; of the others `runs` runs each, counted up to all of them. Processes run as many at a
-    time as there are cores, with a filled cache. Compilation, which the first two do once, is separate; the first
-    splits its rows over devices, as a sweep does.
+    The program, its rows split over devices as in a sweep, is measured whole; of the others `runs` runs each,
+    extrapolated to all. A process per core runs at a time, with a filled cache. Compilation, once in the first two, is
+    measured apart.
     """
     costs: dict[str, int | float] = {"runs": (total := sweep.points * sweep.seeds), "runs_measured": runs}
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:  # with devices of its own

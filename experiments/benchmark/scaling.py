@@ -1,4 +1,4 @@
-"""The parts of an iteration's time, and how the time of a tick grows with what may grow by a factor of 16."""
+"""The parts of an iteration's time, and the growth of a tick's time along four axes, each over a factor of 16."""
 
 import itertools
 import tempfile
@@ -21,16 +21,15 @@ from taic_jax.runtime.checkpoint import Checkpoints
 
 FACTORS = (1, 4, 16)
 SMALLEST = {"environments": 16, "seeds": 1, "option length": 2, "observation size": 8}
-SAVED = 10
-"""Iterations in a call of `saving_loop`."""
+SAVED = 10  # Iterations in a call of `saving_loop`.
 
 
 def shares(env: envs.Env, config: PPOConfig, rounds: int) -> dict[str, float]:
-    """Return which share of an iteration of flat training each part takes.
+    """Return the share of each part in an iteration of flat training.
 
-    Loops are nested, and each part is what the next loop takes beyond the one before: the engine alone; the task in
-    jit, which hands arrays to the engine and adds rewards and resets; the rollout, which adds the policy; the
-    iteration, which adds advantages and updates. All make the same number of ticks, the first three the very same ones.
+    Loops are nested, and a part is the difference of two: the engine alone; the task in jit, which hands arrays to the
+    engine and adds rewards and resets; the rollout, which adds the policy; the iteration, which adds advantages and
+    updates. All make the same number of ticks, the first three under the same actions.
     """
     policy = loops.untrained_rollout(env, config.num_envs, config.rollout_length)
     actions, training = policy.run()[1].action, Training(env, IdentityExecutor(env.action_size), config)
@@ -42,10 +41,7 @@ def shares(env: envs.Env, config: PPOConfig, rounds: int) -> dict[str, float]:
 
 
 def saving_loop(training: Training, checkpoints: Checkpoints | None = None) -> Loop:
-    """Return ten iterations with a checkpoint after each, written while the next is computed, as a run has them.
-
-    The last checkpoint is waited for. Without checkpoints, none are made.
-    """
+    """Return ten iterations with a checkpoint, if any, after each, written while the next is computed, as in a run."""
     steps = itertools.count(1)
 
     def run() -> None:
@@ -60,7 +56,7 @@ def saving_loop(training: Training, checkpoints: Checkpoints | None = None) -> L
 
 
 def saving(env: envs.Env, config: PPOConfig, counts: Sequence[int], rounds: int) -> dict[int, float]:
-    """Return, by the number of seeds, which share of the time without checkpoints one after each iteration adds."""
+    """Return by the number of seeds the time that a checkpoint after each iteration adds, as a share."""
     shares = {}
     for seeds in counts:
         training = Training(env, IdentityExecutor(env.action_size), config, seeds)
@@ -72,22 +68,19 @@ def saving(env: envs.Env, config: PPOConfig, counts: Sequence[int], rounds: int)
 
 
 class Widened(envs.Wrapper):
-    """A task whose observation is followed by functions of it, up to a size of at least its own."""
+    """A task whose observation is extended to `size` by functions of it."""
 
     def __init__(self, env: envs.Env, size: int):
         super().__init__(env)
         self.observation_size = size
 
     def reset(self, key: Key[Array, ""]) -> envs.State:
-        """Reset and widen the observation."""
         return self._widen(self.env.reset(key))
 
     def restart(self, key: Key[Array, ""], ended: Any) -> envs.State:
-        """Restart and widen the observation."""
         return self._widen(self.env.restart(key, ended))
 
     def step(self, state: envs.State, action: Float[Array, " A"]) -> envs.State:
-        """Step and widen the observation."""
         return self._widen(self.env.step(state, action))
 
     def _widen(self, state: envs.State) -> envs.State:
@@ -97,27 +90,26 @@ class Widened(envs.Wrapper):
 
 
 def scaling(env: envs.Env, config: PPOConfig, steps: int, rounds: int) -> Iterator[Row]:
-    """Yield what a tick of training costs along each axis, the others fixed; `of_linear` above 1 is worse than linear.
+    """Yield the cost of a tick of training along each axis, the others fixed; `of_linear` above 1 is worse than linear.
 
-    More environments or seeds make more ticks, so growing in proportion leaves the time of a tick as it is; longer
-    options and wider observations make the same ticks, which then take longer in proportion.
+    More environments or seeds make more ticks: linear is a constant time of a tick. Longer options and wider
+    observations make as many ticks: linear is a time in proportion.
     """
     for axis, first in SMALLEST.items():
         values = [first * factor for factor in FACTORS]
         speeds = interleave({str(value): _at(env, config, steps, axis, value) for value in values}, rounds)
         for value, speed in zip(values, speeds.values(), strict=True):
-            allowed = 1 if axis in ("environments", "seeds") else value / first
-            of_linear = speeds[str(first)].ratio(speed) / allowed
+            linear = 1 if axis in ("environments", "seeds") else value / first
+            of_linear = speeds[str(first)].ratio(speed) / linear
             yield {"axis": axis, "value": value, "microseconds": 1e6 / speed.median, "of_linear": of_linear}
 
 
 def _at(env: envs.Env, config: PPOConfig, steps: int, axis: str, value: int) -> Training:
-    """Return the training loop with one axis at a value; all but the option length are measured on flat training."""
-    flat = IdentityExecutor(env.action_size)
-    if axis == "environments":
-        return Training(env, flat, replace(config, num_envs=value))
-    if axis == "seeds":
-        return Training(env, flat, config, value)
+    """Return the training loop with one axis at a value, of flat training but for the option length."""
+    if axis == "option length":
+        options = loops.options_config("fixed", "open", steps, length=value)
+        return Training(env, loops.executor_of(env, options), config)
     if axis == "observation size":
-        return Training(Widened(env, max(value, env.observation_size)), flat, config)
-    return Training(env, loops.executor_of(env, loops.options_config("fixed", "open", steps, length=value)), config)
+        env = Widened(env, max(value, env.observation_size))
+    config = replace(config, num_envs=value) if axis == "environments" else config
+    return Training(env, IdentityExecutor(env.action_size), config, value if axis == "seeds" else 1)

@@ -6,6 +6,7 @@ python -m taic_jax.experiments.benchmark.throughput --task ant --num-envs 2048 -
 """
 
 import dataclasses
+import itertools
 import sys
 from collections.abc import Sequence
 from functools import partial
@@ -26,8 +27,7 @@ from taic_jax.experiments.benchmark.timing import Speeds, Ticking, interleave
 from taic_jax.options.execution import Executor
 
 HEADLINE = "option_training"
-PAPER = ("fixed", "open")
-"""The options of the row that stands for option training: the paper's."""
+PAPER = ("fixed", "open")  # The options of the row that stands for option training: the paper's.
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,26 +46,18 @@ class Arguments(Command):
     seeds: int = 5  # Seeds of the rows with several.
     rules: tuple[Literal["fixed", "output", "predict"], ...] = ("fixed", "output", "predict")  # Termination rules.
     decoders: tuple[Literal["open", "closed"], ...] = ("open", "closed")  # Decoders.
-    steps: int = 200
-    """Gradient steps in which the options are learnt; it changes how long they last, and so the speed."""
+    steps: int = 200  # Gradient steps in which the options are learnt; their number changes the options' duration.
     rounds: int = 5  # Rounds in which each loop runs once; the table has medians.
-    starts: bool = False
-    """Measure too how long a run takes to its first logged iteration, with an empty and a filled cache of programs, and
-    resumed."""
-    checkpoints: bool = False  # Measure too what a checkpoint after each iteration costs, at one seed and at several.
+    starts: bool = False  # Measure too a run's time to its first logged iteration: empty cache, filled one, resumed.
+    checkpoints: bool = False  # Measure too the cost of a checkpoint after each iteration, at one seed and at several.
     scaling: bool = False
-    """Measure too what a tick costs as environments, seeds, option length and observation size grow by 16."""
+    """Measure too the cost of a tick as environments, seeds, option length and observation size grow by 16."""
     sweep: bool = False  # Measure too 64 points x 4 seeds in one program, in a loop, and in separate processes.
     sweep_ticks: int = 65536  # Ticks of each run of the sweep.
 
 
 def make_env(arguments: Arguments) -> envs.Env:
-    """Make the task with the model asked for.
-
-    Raises:
-      UnknownNameError: there is no such task.
-      MissingExtraError: its model needs a package that is not installed.
-    """
+    """Make the task with the model of the arguments; raise the errors of `envs.make_env`."""
     takes_model = "model" in envs.environment_options(arguments.task)
     model = arguments.model or ("gym" if arguments.peers and takes_model else "brax")
     return envs.make_env(arguments.task, arguments.backend, model=model)
@@ -74,14 +66,12 @@ def make_env(arguments: Arguments) -> envs.Env:
 def our_loops(arguments: Arguments, env: envs.Env) -> dict[str, Ticking]:
     """Return the loops of the engine, the rollout, and training: flat, over options, and of several seeds."""
     rollout = loops.untrained_rollout(env, arguments.num_envs, arguments.rollout_length)
-    ours: dict[str, Ticking] = {}
-    if loops.has_engine(env):
-        ours["engine"] = loops.bare_engine(env, rollout.run()[1].action)
-    ours["rollout"] = rollout
+    engine = {"engine": loops.bare_engine(env, rollout.run()[1].action)} if loops.has_engine(env) else {}
+    ours: dict[str, Ticking] = {**engine, "rollout": rollout}
     options: dict[str, OptionsConfig | None] = {"flat_training": None}
-    for kind in [(rule, decoder) for decoder in arguments.decoders for rule in arguments.rules]:
-        name = HEADLINE if kind == PAPER else f"{HEADLINE}/{'/'.join(kind)}"
-        options[name] = loops.options_config(*kind, arguments.steps)
+    for decoder, rule in itertools.product(arguments.decoders, arguments.rules):
+        name = HEADLINE if (rule, decoder) == PAPER else f"{HEADLINE}/{rule}/{decoder}"
+        options[name] = loops.options_config(rule, decoder, arguments.steps)
     ticks = loops.untrained_ticks(env)
     executors = {name: loops.executor_of(env, config, ticks) for name, config in options.items()}
     ours |= {name: Training(env, executor, arguments.training) for name, executor in executors.items()}
@@ -94,23 +84,23 @@ def our_loops(arguments: Arguments, env: envs.Env) -> dict[str, Ticking]:
 def several_seeds(
     arguments: Arguments, env: envs.Env, executor: Executor, options: OptionsConfig | None
 ) -> Training | SeedsApart:
-    """Return training of several seeds: side by side on an accelerator, on a CPU split over its cores."""
+    """Return training of several seeds: in one program on an accelerator, split over the cores of a CPU."""
     if jax.default_backend() == "cpu":
         return SeedsApart(partial(make_env, arguments), arguments.training, arguments.seeds, options)
     return Training(env, executor, arguments.training, arguments.seeds)
 
 
 def measure(arguments: Arguments, env: envs.Env) -> dict[str, dict[str, Any]]:
-    """Return a row per loop: median ticks per second, medians of its ratios round by round, and a remark.
+    """Return a row per loop: median ticks per second, ratios to the engine and to flat training, and a remark.
 
-    Ratios are to the engine and to flat training; what does not run has a remark alone.
+    A loop that does not run has a remark alone.
     """
-    measured, remarks = our_loops(arguments, env), {}
+    all_loops, remarks = our_loops(arguments, env), {}
     if arguments.peers:
         others, remarks = peers.loops(arguments.task, arguments.training)
-        measured |= others
-    speeds = interleave(measured, arguments.rounds)
-    for name, loop in measured.items():
+        all_loops |= others
+    speeds = interleave(all_loops, arguments.rounds)
+    for name, loop in all_loops.items():
         if isinstance(loop, Training | SeedsApart) and HEADLINE in name:
             remarks[name] = f"{loop.duration:.1f} ticks a decision"
     if arguments.peers:
@@ -121,7 +111,7 @@ def measure(arguments: Arguments, env: envs.Env) -> dict[str, dict[str, Any]]:
 
 
 def row(speeds: dict[str, Speeds], name: str, remark: str) -> dict[str, Any]:
-    """Return one row of the table; what was not measured is None."""
+    """Return one row of the table, with None for each missing number."""
     own, engine, flat = (speeds.get(which) for which in (name, "engine", "flat_training"))
     return {
         "ticks_per_second": own and own.median,
@@ -133,11 +123,7 @@ def row(speeds: dict[str, Speeds], name: str, remark: str) -> dict[str, Any]:
 
 
 def check(arguments: Arguments) -> None:
-    """Refuse what could only fail after minutes.
-
-    Raises:
-      ConfigError: a number is too small, the minibatches of peers would not be equal, or a preset is missing.
-    """
+    """Raise `ConfigError` at a number that is too small, minibatches of unequal size, or a missing preset."""
     for name in ("num_envs", "rollout_length", "seeds", "steps", "rounds", "sweep_ticks"):
         if getattr(arguments, name) < 1:
             raise ConfigError(f"--{name.replace('_', '-')}: expected at least 1, got {getattr(arguments, name)}")
@@ -149,7 +135,7 @@ def check(arguments: Arguments) -> None:
 
 
 def report(arguments: Arguments) -> dict[str, Any]:
-    """Measure all that is asked for, print each table when it is there, and return the figures."""
+    """Measure, print each table as it comes, and return the figures."""
     check(arguments)
     env = make_env(arguments)
     figures: dict[str, Any] = {}
@@ -172,8 +158,7 @@ def report(arguments: Arguments) -> dict[str, Any]:
         figures["scaling"] = show(scaling(env, arguments.training, arguments.steps, arguments.rounds))
     if arguments.sweep:
         config = load_config("nav2d").train.ppo if arguments.task == "nav2d" else arguments.training
-        costs = sweep_costs(Sweep(arguments.task, 64, 4, arguments.sweep_ticks, config), 8)
-        figures["sweep"] = costs
+        figures["sweep"] = costs = sweep_costs(Sweep(arguments.task, 64, 4, arguments.sweep_ticks, config), 8)
         ways = ("one_program", "loop", "processes")
         show({"sweep": way, "seconds": costs[way], "ratio": costs[way] / costs["one_program"]} for way in ways)
         show([costs])
@@ -181,7 +166,7 @@ def report(arguments: Arguments) -> dict[str, Any]:
 
 
 def share_text(name: str, share: float) -> str:
-    """Return the share of a part, a difference of two loops, which noise may make less than nothing."""
+    """Return the share of a part in words; it is a difference of two loops, and noise may make it negative."""
     return f"{name} {share:.0%}" if share >= 0 else f"{name} too little to be told from noise"
 
 

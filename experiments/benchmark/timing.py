@@ -1,4 +1,4 @@
-"""Interleaved timing: loops take turns, so that whatever slows the machine down for a while slows down all of them."""
+"""Interleaved timing: loops take turns, so that a slow spell of the machine slows down all of them."""
 
 import statistics
 import time
@@ -11,12 +11,10 @@ import numpy as np
 
 @runtime_checkable
 class Ticking(Protocol):
-    """Something to measure: a call runs it once, and makes so many ticks."""
+    """A loop to measure: a call runs it once, and makes `ticks` ticks."""
 
     @property
-    def ticks(self) -> int:
-        """Ticks that one call makes."""
-        ...
+    def ticks(self) -> int: ...
 
     def __call__(self) -> Any: ...
 
@@ -28,7 +26,7 @@ class Loop(NamedTuple):
     ticks: int
 
     def __call__(self) -> None:
-        """Run it, and wait for its arrays."""
+        """Run the function, and wait for its arrays."""
         jax.block_until_ready(self.run())
 
 
@@ -44,7 +42,7 @@ class Speeds(NamedTuple):
         return statistics.median(self.rounds)
 
     def ratio(self, other: "Speeds") -> float:
-        """Return how many times as fast as the other this is: the median over rounds, where both have as many."""
+        """Return this speed over the other: the median over rounds, or of medians where their numbers differ."""
         if len(self.rounds) != len(other.rounds):
             return self.median / other.median
         return statistics.median(np.divide(self.rounds, other.rounds))
@@ -58,7 +56,7 @@ def seconds(run: Callable[[], Any]) -> float:
 
 
 def interleave(loops: Mapping[str, Ticking], rounds: int) -> dict[str, Speeds]:
-    """Call every loop once to compile it and to warm up, then once in each round, and return their speeds by name."""
+    """Call every loop once to compile it, then once in each round, and return the speeds by name."""
     speeds = {name: Speeds([], seconds(loop)) for name, loop in loops.items()}
     for _ in range(rounds):
         for name, loop in loops.items():

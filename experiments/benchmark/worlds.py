@@ -1,4 +1,4 @@
-"""Measure every task on every backend beside the bare engine; MJX's solver settings; ants let loose.
+"""Measure every task on every backend beside the bare engine; MJX's solver settings; ants that leave their arena.
 
 python -m taic_jax.experiments.benchmark.worlds --json worlds.json
 python -m taic_jax.experiments.benchmark.worlds --solver --tasks ant ant_push
@@ -38,11 +38,11 @@ class Arguments(Command):
     num_envs_mjx: int = 64  # Environments on mjx.
     length: int = 64  # Ticks per environment and measurement on mujoco; mjx makes a quarter of them.
     solver: bool = False  # Measure MJX's solver settings instead: speed, and error of a tick against the C engine.
-    soak: bool = False  # Let random ants loose in the arenas instead, and count those that leave them.
+    soak: bool = False  # Let ants act at random in the arenas instead, and count those that leave them.
 
 
 def plain_mjx(env: envs.Env, actions: jax.Array) -> Loop:
-    """Return a compiled loop of `mjx.step` with the same model and settings, that keeps the whole `mjx.Data`."""
+    """Return a compiled loop of `mjx.step` on the whole `mjx.Data`, with the same model and settings."""
     with third_party():
         from mujoco import mjx
     data = jax.tree.map(lambda x: jnp.broadcast_to(x, (actions.shape[1], *jnp.shape(x))), env.physics._data)
@@ -56,8 +56,7 @@ def plain_mjx(env: envs.Env, actions: jax.Array) -> Loop:
     return Loop(partial(jax.jit(run), data), actions[..., 0].size)
 
 
-BARE = {"mujoco": bare_engine, "mjx": plain_mjx}
-"""Warp's data cannot be handed in by the batch."""
+BARE = {"mujoco": bare_engine, "mjx": plain_mjx}  # Warp has none: its data cannot be passed in as a batch.
 
 
 def measure(arguments: Arguments, task: str, backend: str) -> Row:
@@ -67,21 +66,18 @@ def measure(arguments: Arguments, task: str, backend: str) -> Row:
     if backend in ("mjx", "warp"):
         num_envs, length = arguments.num_envs_mjx, arguments.length // 4
     row = {"task": task, "backend": backend, "obs": env.observation_size, "act": env.action_size, "envs": num_envs}
+    row |= {"contacts": possible_contacts(env)} if _has_physics(env) else {}
     actions = random_actions(env, num_envs, length)
     loops = {"ours": stepping(env, actions)}
-    if _has_physics(env):
-        row["contacts"] = possible_contacts(env)
-        if backend in BARE:
-            loops["bare"] = BARE[backend](env, actions)
-    speeds = interleave(loops, ROUNDS)
-    row["ticks_per_second"] = speeds["ours"].median
-    if "bare" in speeds:
-        row |= {"bare": speeds["bare"].median, "ratio": speeds["ours"].ratio(speeds["bare"])}
-    return row
+    if _has_physics(env) and backend in BARE:
+        loops["bare"] = BARE[backend](env, actions)
+    ours, *bare = interleave(loops, ROUNDS).values()
+    row["ticks_per_second"] = ours.median
+    return row | ({"bare": bare[0].median, "ratio": ours.ratio(bare[0])} if bare else {})
 
 
 def soak(arguments: Arguments, task: str, backend: str) -> Row:
-    """Return how many states of `num_envs_mjx` ants in `length` ticks are outside their arena or not finite."""
+    """Count the states of `num_envs_mjx` ants in `length` ticks that are outside their arena or not finite."""
     env = envs.make_env(task, backend)
     actions = random_actions(env, arguments.num_envs_mjx, arguments.length)
     qpos = np.asarray(stepping(env, actions, lambda before, action, after: after.physics.qpos).run()[1])
@@ -108,11 +104,8 @@ def measure_solver(task: str, num_envs: int, length: int) -> Iterator[Row]:
     """
     env = envs.make_env(task, "mujoco")
     exact = jax.vmap(env.physics.step)
-    state, ctrl = (
-        jax.vmap(env.reset)(jax.random.split(jax.random.key(0), num_envs)).physics,
-        random_actions(env, num_envs, 1)[0],
-    )
-    actions = random_actions(env, num_envs, 50)
+    state = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), num_envs)).physics
+    ctrl, actions = random_actions(env, num_envs, 1)[0], random_actions(env, num_envs, 50)
     state = jax.jit(lambda state: jax.lax.scan(lambda s, a: (exact(s, a), None), state, actions)[0])(state)
     expected = exact(state, ctrl)
     for iterations, ls_iterations in SETTINGS:
@@ -128,7 +121,7 @@ def measure_solver(task: str, num_envs: int, length: int) -> Iterator[Row]:
 
 
 def rows(arguments: Arguments) -> Iterator[Row]:
-    """Yield each row of the table when it is measured."""
+    """Yield each row of the table as it is measured."""
     for task in arguments.tasks or (ARENAS if arguments.soak else envs.environment_names()):
         has_physics = _has_physics(envs.make_env(task))
         if arguments.solver:

@@ -1,10 +1,10 @@
-"""Do the runs that the figures need, and keep a row of each in the table: see README.md of the experiments.
+"""Do the runs of the figures, and add a row of each to the table: see README.md of the experiments.
 
 python -m taic_jax.experiments.evidence --list
 python -m taic_jax.experiments.evidence --only nav2d
 
-What is in the table is not run again; a finished run's folder is taken in as it is; what was interrupted goes on from
-its last checkpoint.
+A run in the table is not done again, a finished one only adds its rows, and an interrupted one goes on from its last
+checkpoint.
 """
 
 import dataclasses
@@ -34,12 +34,9 @@ class Arguments:
 
     only: tuple[str, ...] = ()
     """Do only the runs whose names start so, as in half_cheetah or half_cheetah/strong; empty does all."""
-    list: bool = False
-    """List every run and what is missing of it, and stop."""
-    table: Path = TABLE
-    """The table."""
-    run_dir: Path = Path("runs/evidence")
-    """Folder of the runs."""
+    list: bool = False  # List every run and its progress, and stop.
+    table: Path = TABLE  # The table.
+    run_dir: Path = Path("runs/evidence")  # Folder of the runs.
 
 
 def sources(cell: Cell, run_dir: Path) -> set[str]:
@@ -49,38 +46,32 @@ def sources(cell: Cell, run_dir: Path) -> set[str]:
 
 
 def plan(cells: Sequence[Cell], only: tuple[str, ...], present: Set[Key], run_dir: Path) -> list[Cell]:
-    """Return the runs to be done, and before them those that they take something from, however far back, and that are
-    not finished; a run that gives no row is done only for others.
-
-    Raises:
-        TableError: no run has such a name.
-    """
+    """Return the runs to do, after their unfinished sources and those of the sources; raise `TableError` if no run has
+    such a name. A run without rows is done only as a source."""
     unknown = [text for text in only if not any(cell.name.startswith(text) for cell in cells)]
     if unknown:
         raise TableError(f"--only: expected the start of a run's name, got {unknown[0]}; --list shows them")
-    wanted = [cell for cell in cells if cell.keys - present and (not only or cell.name.startswith(only))]
-    names = {cell.name for cell in wanted}
-    for cell in reversed(cells):  # those that others take something from stand before them
+    names = {cell.name for cell in cells if cell.keys - present and (not only or cell.name.startswith(only))}
+    for cell in reversed(cells):  # sources stand before the runs that use them
         if cell.name in names:
             names |= {name for name in sources(cell, run_dir) if not RunFolder(run_dir / name).finished}
     return [cell for cell in cells if cell.name in names]
 
 
 def do(cell: Cell, run_dir: Path, shard: Shard = "none") -> None:
-    """Do a run, or what is left of it, with its seeds split over devices where asked."""
+    """Begin, resume or check a run, with its seeds split over devices by `shard`."""
     folder = run_dir / cell.name
     run = RunFolder(folder)
     if run.finished:
         run.prepare(cell.config, resume=True)  # only checks that it is this run
     elif len(cell.stages) == 1 and not set(cell.stages.values()) & {"train", "options"}:
-        (stage,) = cell.stages.values()
-        run_flat(cell, folder, stage, make_devices(shard, cell.config), run.begun)
+        run_flat(cell, folder, make_devices(shard, cell.config), run.begun)
     else:
         run_pipeline(cell.config, folder, resume=run.begun, shard=shard)
 
 
 def make_row(cell: Cell, run_dir: Path, method: str, stage: str) -> dict[str, Any]:
-    """Return the row of one method of a finished run; of options on a robot with the measures of their spaces."""
+    """Return the row of one method of a finished run, with the measures of option spaces on a robot."""
     folder = run_dir / cell.name
     if method == PATHS:
         row = row_of(folder, run_dir, PATHS, "train") | {"curves": {}, "grid": [], "ticks": 0}
@@ -92,9 +83,9 @@ def make_row(cell: Cell, run_dir: Path, method: str, stage: str) -> dict[str, An
     return row
 
 
-def run_flat(cell: Cell, folder: Path, stage: str, devices: Devices, resume: bool) -> None:
-    """Train flat PPO alone: `collect`, which keeps its experience, or a baseline."""
-    config = cell.config
+def run_flat(cell: Cell, folder: Path, devices: Devices, resume: bool) -> None:
+    """Train flat PPO alone: `collect`, which saves its experience, or a baseline."""
+    config, (stage,) = cell.config, cell.stages.values()
     env, source = make_envs(config)
     _, policy = take_over(config, env, source)
     with Run.open(config, folder, resume=resume, devices=devices) as run:
@@ -103,28 +94,27 @@ def run_flat(cell: Cell, folder: Path, stage: str, devices: Devices, resume: boo
 
 
 def show(cells: Sequence[Cell], rows: dict[Key, dict[str, Any]], arguments: Arguments) -> None:
-    """Print every run: its figure, its interactions, and how far it is."""
+    """Print every run: its figure, its interactions, and its progress."""
     for cell in cells:
         if arguments.only and not cell.name.startswith(arguments.only):
             continue
-        folder = arguments.run_dir / cell.name
-        if RunFolder(folder).finished:
+        folder, own = arguments.run_dir / cell.name, [rows[key] for key in cell.keys & rows.keys()]
+        if cell.stages and len(own) == len(cell.keys):
+            state = f"in the table, took {max(row['seconds'] for row in own) / 60:.0f} minutes"
+            if {row["config"] for row in own} != {config_hash(cell.config, arguments.run_dir)}:
+                state += ", is of another config: cut its rows to do it again"
+        elif RunFolder(folder).finished:
             state = "finished, to be taken in" if cell.stages else "finished"
         elif folder.exists():
             state = "begun"
         else:
             state = "missing" if cell.stages else "made when another run needs it"
-        if cell.stages and cell.keys <= rows.keys():
-            own = [rows[key] for key in cell.keys]
-            state = f"in the table, took {max(row['seconds'] for row in own) / 60:.0f} minutes"
-            if {row["config"] for row in own} != {config_hash(cell.config, arguments.run_dir)}:
-                state += ", is of another config: cut its rows to do it again"
         ticks = cell.config.train.ticks if "collect" not in cell.stages.values() else cell.config.collect.ticks
         print(f"figure {cell.figure}  {cell.name:36} {cell.config.seeds:3} seeds x {ticks:9,} ticks  {state}")
 
 
 def execute(arguments: Arguments) -> None:
-    """List the runs, or do those that are missing."""
+    """List the runs, or do the missing ones."""
     cells = all_cells(arguments.run_dir)
     rows = {(row["task"], row["method"], row["seed"]): row for row in read_table(arguments.table)}
     planned = plan(cells, arguments.only, rows.keys(), arguments.run_dir)

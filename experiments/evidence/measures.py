@@ -1,6 +1,6 @@
-"""What is measured of a finished run: its option spaces, the paths its options draw, and its recovery from a change.
+"""Measures of a finished run, a number per seed: option spaces, paths that options draw, recovery from a change.
 
-Measures are one number per seed; examples are those of the first seed's option model, and are drawn.
+Examples for the figures are of the first seed's option model.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -31,29 +31,18 @@ SPACE_MEASURES = (
     "window/mlp_r2/end", "window/mutual_information/change", "window/mutual_information/permuted",
 )  # fmt: skip
 PREFIX = "space/"
-COUNT = 500
-"""Options of each kind that are measured."""
-SHOWN = 300
-"""Options of the example."""
-STEPS = 11
-"""Codes from one window's to another's, both included."""
-SWEEP = np.linspace(-2.0, 2.0, 9)
-"""What is added to one dimension of a code, in standard deviations of the prior."""
-PAIRS = 100
-"""Pairs of windows, and codes whose dimensions are changed, of each option model."""
-EPISODES = 100
-"""Fewest episodes that a share of successes is taken of."""
-AFTER = 200_000
-"""Ticks after the change in which a method may recover: 1000 episodes of the longest kind."""
-RECOVERED = 0.9
-"""Share of these last episodes that reach the goal where a seed has recovered."""
+COUNT = 500  # Options of each kind that are measured.
+SHOWN = 300  # Options of the example.
+STEPS = 11  # Codes from one window's to another's, both included.
+SWEEP = np.linspace(-2.0, 2.0, 9)  # Changes of one dimension of a code, in standard deviations of the prior.
+PAIRS = 100  # Pairs of windows, and codes whose dimensions are changed, of each option model.
+EPISODES = 100  # Fewest episodes of a share of successes.
+AFTER = 200_000  # Ticks after the change in which a method may recover: 1000 episodes of the longest kind.
+RECOVERED = 0.9  # Share of these last episodes that reach the goal if a seed has recovered.
 
 
 def each_model(folder: Path) -> Iterator[tuple[OptionModel, Experience, Array]]:
-    """Yield the option model of each seed of a run, the experience that it was learnt from, and a key.
-
-    One at a time: the experience of all would not fit into memory.
-    """
+    """Yield the option model of each seed, its experience and a key, one by one: all do not fit into memory."""
     config = RunFolder(folder).config()
     source = Path(config.options.source or folder)
     (name,) = config.options.experience or (COLLECT,)
@@ -68,18 +57,13 @@ def measure_spaces(folder: Path) -> dict[str, list[float]]:
     """Return the measures of every seed's option space, under `space/NAME`."""
     config = RunFolder(folder).config()
     source = make_envs(config)[1]
-    measured = [
-        option_space.measure(source, config.options, model, experience, key, COUNT)
-        for model, experience, key in each_model(folder)
-    ]
-    return {f"{PREFIX}{name}": [row[name] for row in measured] for name in SPACE_MEASURES}
+    rows = [option_space.measure(source, config.options, *each, COUNT) for each in each_model(folder)]
+    return {f"{PREFIX}{name}": [row[name] for row in rows] for name in SPACE_MEASURES}
 
 
 def example_space(folder: Path) -> dict[str, Any]:
-    """Return options [N, D] drawn from the prior, and the states [N, P] that each led to from one state.
-
-    A state is measured in standard deviations of the experience.
-    """
+    """Return options [N, D] drawn from the prior, and the states [N, P] after each, in standard deviations of the
+    experience; all begin in one state."""
     config = RunFolder(folder).config()
     env, source = make_envs(config)
     model = jax.tree.map(lambda x: x[0], load_options(folder, env, config.options, config.seeds))
@@ -93,7 +77,7 @@ def example_space(folder: Path) -> dict[str, Any]:
 
 
 def as_path(actions: Float[Array, "*batch L 2"]) -> Float[Array, "*batch L+1 2"]:
-    """Return the positions in m, from the origin, that velocities lead through where there are no walls."""
+    """Return the positions in m, from the origin, of a point with these velocities and no walls."""
     steps = MAX_SPEED * Navigation.dt * jnp.clip(actions, -1.0, 1.0)
     return jnp.cumsum(jnp.concatenate([jnp.zeros_like(steps[..., :1, :]), steps], axis=-2), axis=-2)
 
@@ -105,11 +89,8 @@ def decode(config: OptionsConfig, model: OptionModel, codes: Float[Array, "N D"]
 
 
 def straightness(paths: Float[np.ndarray, "N I L 2"]) -> np.ndarray:
-    """Return how smoothly N rows of I paths pass from the first to the last, each in (0, 1].
-
-    It is the distance of the first and last path over the length of the way through all of them, a path being one
-    point of all its positions: 1 where each step leads straight on.
-    """
+    """Return the straightness of N rows of I paths, each in (0, 1]: the distance of the first and last path over the
+    length of the way through all, a path being one point of all its positions."""
     points = paths.reshape(*paths.shape[:2], -1)
     way = np.linalg.norm(np.diff(points, axis=1), axis=-1).sum(axis=1)
     return np.linalg.norm(points[:, -1] - points[:, 0], axis=-1) / np.maximum(way, 1e-9)
@@ -128,11 +109,11 @@ def _draw_windows(
 
 
 def measure_paths(config: OptionsConfig, model: OptionModel, experience: Experience, key: Array) -> dict[str, Any]:
-    """Measure one option model, and return its first pair and code as an example.
+    """Measure one option model, and return the paths of its first pair and code as the `example`.
 
-    Returns: `smoothness` of interpolated codes; `shuffled`, that of as many codes between the same ends that belong to
-    other windows; `effect` [D], by how much a dimension moves the end point over the sweep, in m (root mean square),
-    the strongest first; and the `example`s' paths.
+    `smoothness` is the straightness of interpolated codes; `shuffled`, that of codes of other windows between the same
+    ends; `effect` [D], each dimension's spread of the end point over the sweep, in m (root mean square), the strongest
+    first.
     """
     config = as_arrays(config)
     key_windows, key_shuffle = jax.random.split(key)
@@ -151,40 +132,28 @@ def measure_paths(config: OptionsConfig, model: OptionModel, experience: Experie
     effect = np.sqrt((spread**2).sum(axis=-1).mean(axis=0))
     order = np.argsort(-effect)
     drawn = np.asarray(as_path(actions))
-    example = {
-        "interpolated": paths[0][0],
-        "between": drawn[[0, PAIRS]],
-        "swept": paths[2][0][order],
-        "original": drawn[0],
-    }
-    return {
-        "smoothness": float(straightness(paths[0]).mean()),
-        "shuffled": float(straightness(paths[1]).mean()),
-        "effect": effect[order].tolist(),
-        "example": {name: value.tolist() for name, value in example.items()},
-    }
+    example = {"interpolated": paths[0][0], "between": drawn[[0, PAIRS]]}
+    example |= {"swept": paths[2][0][order], "original": drawn[0]}
+    smoothness, shuffled = (float(straightness(x).mean()) for x in paths[:2])
+    numbers = {"smoothness": smoothness, "shuffled": shuffled, "effect": effect[order].tolist()}
+    return numbers | {"example": {name: value.tolist() for name, value in example.items()}}
 
 
 def measure_run_paths(folder: Path) -> dict[str, Any]:
-    """Return the `numbers` of what every seed's options of the room draw (section 4.1, figure 5), and the `example`."""
+    """Return the `numbers` of the paths of every seed's options (section 4.1, figure 5), and the `example`."""
     options = RunFolder(folder).config().options
-    measured = [measure_paths(options, *each) for each in each_model(folder)]
-    numbers = {name: [row[name] for row in measured] for name in ("smoothness", "shuffled")}
-    numbers |= {f"effect/{d}": [row["effect"][d] for row in measured] for d in range(options.size)}
-    return {"numbers": numbers, "example": measured[0]["example"]}
+    rows = [measure_paths(options, *each) for each in each_model(folder)]
+    numbers = {name: [row[name] for row in rows] for name in ("smoothness", "shuffled")}
+    numbers |= {f"effect/{d}": [row["effect"][d] for row in rows] for d in range(options.size)}
+    return {"numbers": numbers, "example": rows[0]["example"]}
 
 
 def recovery_of(rows: Sequence[Row], stage: str) -> tuple[np.ndarray, dict[str, list]]:
-    """Return how a run fares where its task changes (section 4.1): successes per iteration, and numbers per seed.
+    """Return the share of episodes [K, I] that reached the goal in each iteration, and numbers per seed (section 4.1).
 
-    The former are the share of episodes [K, I] that reached the goal. Numbers, NaN where the task never changed:
-    `changed_at`, the tick at which it did; `success_before` and `success_after`, the share of successes among the last
-    100 episodes before it, and among the last 100 that ended in the `AFTER` ticks behind it; `ticks_after`, the ticks
-    that a seed had behind it.
-
-    Args:
-        rows: of the stage, one per iteration.
-        stage: its name.
+    `changed_at` is the tick at which the task changed, or NaN; `success_before` and `success_after` are the share of
+    successes among the last 100 episodes before, and among the last 100 of the `AFTER` ticks after the change, NaN
+    where there are fewer; `ticks_after` are all ticks after it. A row of the log is an iteration.
     """
     unit = rows[0]["ticks"]
     changed, success, episodes = (
@@ -195,32 +164,28 @@ def recovery_of(rows: Sequence[Row], stage: str) -> tuple[np.ndarray, dict[str, 
     shares = np.divide(reached, episodes, out=np.full_like(reached, np.nan), where=episodes > 0)
     numbers: dict[str, list] = {"changed_at": [], "success_before": [], "success_after": [], "ticks_after": []}
     for k in range(len(changed)):
-        behind = np.cumsum(changed[k] * unit)
-        numbers["ticks_after"].append(float(behind[-1]))
-        if not behind[-1]:
-            numbers["changed_at"].append(float("nan"))
-            numbers["success_before"].append(_last_share(reached[k], episodes[k]))
-            numbers["success_after"].append(float("nan"))
-            continue
-        before, within = changed[k] == 0, (changed[k] == 1) & (behind <= AFTER)
-        numbers["changed_at"].append(len(behind) * unit - float(behind[-1]))
+        after = np.cumsum(changed[k] * unit)
+        total = float(after[-1])
+        before, within = changed[k] == 0, (changed[k] == 1) & (after <= AFTER)
+        numbers["changed_at"].append(len(after) * unit - total if total else float("nan"))
         numbers["success_before"].append(_last_share(reached[k, before], episodes[k, before]))
         numbers["success_after"].append(_last_share(reached[k, within], episodes[k, within]))
+        numbers["ticks_after"].append(total)
     return shares, numbers
 
 
 def has_recovered(numbers: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return which seeds recovered [K]; one whose room never changed, or not for long enough, has not."""
+    """Return which seeds recovered [K]; a seed whose room changes too late or never has not."""
     return np.nan_to_num(numbers["success_after"]) >= RECOVERED
 
 
 def has_learnt(numbers: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return which seeds reached the goal as reliably before the change [K]."""
+    """Return which seeds reached the goal that reliably before the change [K]."""
     return np.nan_to_num(numbers["success_before"]) >= RECOVERED
 
 
 def _last_share(reached: np.ndarray, episodes: np.ndarray) -> float:
-    """Return the share of successes of the fewest last iterations that hold `EPISODES` episodes, or NaN."""
+    """Return the share of successes in the fewest last iterations with `EPISODES` episodes, NaN if there are none."""
     counts = np.cumsum(episodes[::-1])
     if not len(counts) or counts[-1] < EPISODES:
         return float("nan")

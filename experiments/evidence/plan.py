@@ -1,6 +1,6 @@
-"""The runs that the paper's figures need, each a folder with a config and the methods that it gives rows of.
+"""The runs of the paper's figures, each a folder with a config and the methods of its rows.
 
-Settings are those of the presets; what stands here is what differs.
+Settings are those of the presets, but for the differences in this file.
 """
 
 from collections.abc import Mapping
@@ -16,31 +16,29 @@ RECOVERY = "nav2d"
 # Interactions with the task; flat PPO of method long has twice as many.
 TICKS = {"ant": 2_000_000} | dict.fromkeys(TRANSFERS, 3_000_000)
 MILLION = 1_000_000
-CAPACITY = MILLION
-"""Ticks of experience kept: of Ant's two million the second half, which all windows there are of."""
+CAPACITY = MILLION  # Ticks of experience; of Ant's two million the second half, which has all its windows.
 FIRST_SEED = 200
-PATHS = "paths"
-"""Method of the row that holds what options of the room draw."""
+PATHS = "paths"  # Method of the row with the paths of the room's options.
 
-# In open loop P is surprised far more often where options are executed than on what it learnt from: with a quantile of
-# the latter they last 2 ticks, with this error about 5. In closed loop it errs less: with that error Hopper's last 9.9
-# of 10 ticks, with this quantile 5.8 (results/delta_search.csv).
+# In open loop P is surprised far more often in execution than on its training data: with a quantile of the latter,
+# options last 2 ticks, with this error about 5. In closed loop it errs less: with that error Hopper's last 9.9 of 10
+# ticks, with this quantile 5.8 (results/delta_search.csv).
 SURPRISE: dict[str, dict[str, Any]] = {
     "open": {"options.delta_unit": "error", "options.delta": 0.5},
     "closed": {"options.delta_unit": "quantile", "options.delta": 0.85},
 }
-# Of a search on Hopper (results/space_search.csv), where the constraints of HalfCheetah in open loop hide too much, and
-# ask for too little. Its weight of L_KL leaves less than a nat of Ant's codes.
+# From a search on Hopper (results/space_search.csv), where L_adv of HalfCheetah in open loop is too strong and L_pred
+# too weak. HalfCheetah's weight of L_KL leaves less than a nat of Ant's codes.
 OPEN: dict[str, dict[str, Any]] = {
     task: {"options.lambda_pred": 3.0, "options.lambda_adv": 0.01} for task in ("hopper", "walker2d", "ant")
 }
 OPEN["ant"]["options.lambda_kl"] = 0.001
-# Of every run but those that say otherwise, whatever the presets have.
+# The default of all runs, in place of the presets' values.
 PLAIN: dict[str, Any] = {"train.baselines": (), "train.fine_tune": FineTuneConfig()}
 SCORED = {"evaluate.episodes": 20, "evaluate.video_ticks": 0}
 
 # Method: label and fewest seeds of figure 7. An option method's name is its termination, decoder and constraints, and
-# `tuned` where PPO changes D too.
+# `tuned` if PPO changes D too.
 METHODS = {
     "strong": ("flat PPO", 20),
     "long": ("flat PPO, twice as long", 10),
@@ -53,12 +51,12 @@ METHODS = {
     "fixed-closed-both": ("Fix-len, closed loop", 10),
     "fixed-closed-both-tuned": ("Fix-len, closed loop, fine-tuned", 20),
 }
-# Of these figure 6 draws an example: the method's name in the paper.
+# The examples of figure 6: the method's name in the paper.
 SPACES = {"fixed-open-none": "RVAE", "output-open-both": "Term-output", "predict-open-both": "Term-predict"}
 BASELINE = "strong"
 FLAT = {"strong": "collect", "weak": "collect", "long": "collect", "repeat": "repeat"}
 """Methods without options, and the stage that trains each."""
-# Beside them, for the table of options: every rule in closed loop, and what the constraints do there.
+# Beside them, for the table of options: every rule in closed loop, and one without constraints.
 OTHERS = dict.fromkeys(("output-closed-both", "predict-closed-both", "fixed-closed-none"), ("", 10))
 # Of figure 8: the method's name, and of figure 5c: the stage of the run that trains it.
 TRANSFERRED = {"open": ("options of Ant, open loop", "train"), "closed": ("options of Ant, closed loop", "train"),
@@ -66,13 +64,11 @@ TRANSFERRED = {"open": ("options of Ant, open loop", "train"), "closed": ("optio
                "transfer": ("flat PPO from Ant's policy", "transfer")}  # fmt: skip
 RECOVERING = {"options": ("options", "train"), "flat": ("flat PPO", "flat")}
 
-
-Key = tuple[str, str, int]
-"""Task, method and first seed, which tell one row from the others."""
+Key = tuple[str, str, int]  # Task, method and first seed, which identify a row.
 
 
 class Cell(NamedTuple):
-    """A run to be done: its folder's name, its config, and the stage that trains each method it gives a row of."""
+    """A planned run: its folder's name, its config, the stage that trains each method of its rows, and the figure."""
 
     name: str
     config: Config
@@ -85,7 +81,7 @@ class Cell(NamedTuple):
         return {(self.config.env.name, method, self.config.seed) for method in self.stages}
 
 
-def changed(config: Config, fields: Mapping[str, Any]) -> Config:
+def replace_all(config: Config, fields: Mapping[str, Any]) -> Config:
     """Replace the fields, or groups of fields, of these dotted names."""
     for name, value in fields.items():
         config = replace(config, name, value)
@@ -93,23 +89,18 @@ def changed(config: Config, fields: Mapping[str, Any]) -> Config:
 
 
 def flat_config(task: str, strength: str, seed: int, seeds: int) -> Config:
-    """Return the config of flat PPO: the task's preset, twice as long, or weak, as the paper's silence suggests."""
+    """Return the config of flat PPO: the task's preset, twice as long, or weak with the paper's preset."""
     config, ticks = load_config(task), TICKS.get(task, MILLION)
-    fields = PLAIN | SCORED | {
-        "collect.ticks": 2 * ticks if strength == "long" else ticks,
-        "options": OptionsConfig(),
-        "train.ticks": ticks,
-        "train.ppo.gamma": config.collect.ppo.gamma,  # whatever suits fine-tuning
-        "seed": seed,
-        "seeds": seeds,
-    }  # fmt: skip
+    fields = PLAIN | SCORED | {"train.ticks": ticks, "seed": seed, "seeds": seeds, "options": OptionsConfig()}
+    fields["collect.ticks"] = 2 * ticks if strength == "long" else ticks
+    fields["train.ppo.gamma"] = config.collect.ppo.gamma  # the preset's own may be for fine-tuning
     if strength == "weak":
         fields["collect.ppo"] = load_config("paper").collect.ppo
-    return changed(config, fields)
+    return replace_all(config, fields)
 
 
 def name_of(task: str, method: str, seed: int) -> str:
-    """Return the name of the run of a method on a robot from this seed on."""
+    """Return the name of the run of a method on a robot whose first seed this is."""
     return f"{task}/{method}" + ("" if seed == FIRST_SEED else f"-{seed}")
 
 
@@ -117,11 +108,11 @@ def with_options(config: Config, task: str, decoder: str) -> Config:
     """Return the config with options of a robot: its preset's in closed loop, HalfCheetah's in open loop."""
     preset = load_config(task if decoder == "closed" else "half_cheetah_open")
     config = replace(config, "options", preset.options)
-    return config if decoder == "closed" else changed(config, OPEN.get(task, {}))
+    return config if decoder == "closed" else replace_all(config, OPEN.get(task, {}))
 
 
 def options_config(task: str, method: str, run_dir: Path, seed: int, seeds: int) -> Config:
-    """Return the config of one kind of options, learnt from what `strong` met with these seeds."""
+    """Return the config of one kind of options, learnt from the experience of `strong` with these seeds."""
     rule, decoder, constraints, *tuned = method.split("-")
     config = with_options(flat_config(task, BASELINE, seed, seeds), task, decoder)
     source = str(run_dir / name_of(task, BASELINE, seed))
@@ -132,16 +123,16 @@ def options_config(task: str, method: str, run_dir: Path, seed: int, seeds: int)
         fields["options.length"] = 10
     if rule == "predict":
         fields |= SURPRISE[decoder]
-    if tuned:  # as the preset does it
+    if tuned:
         train = load_config(task).train
         fields |= {"train.ppo": train.ppo, "train.fine_tune": train.fine_tune}
-    return changed(config, fields)
+    return replace_all(config, fields)
 
 
 def robots(task: str, run_dir: Path, chunk: int = 10) -> list[Cell]:
-    """Return the runs of figure 7 on one task, those that others take experience from first.
+    """Return the runs of figure 7 on one task, sources of experience first.
 
-    Seeds come in runs of `chunk`, so that what is interrupted costs little and more can be added.
+    A run has `chunk` seeds, so that an interruption costs little and seeds can be added.
     """
     cells = []
     for method, (_, minimum) in (METHODS | OTHERS).items():
@@ -158,54 +149,51 @@ def robots(task: str, run_dir: Path, chunk: int = 10) -> list[Cell]:
 def transfers(task: str, run_dir: Path, seeds: int = 10) -> list[Cell]:
     """Return the runs of figure 8 on one task; policy and experience are of the ant's run `ant/source`.
 
-    That is as long as the ant's own runs: after half of it the ant walks too slowly to cross an arena in an episode.
+    That is as long as the ant's own runs: after half the ticks the ant is too slow to cross an arena in an episode.
     """
     ant, preset = load_config("ant"), load_config(f"transfer_{task}")
     runs = {name: str(run_dir / name) for name in ("ant/source", "ant/source-open", "ant/source-steering")}
     source = one_iteration(replace(ant, "collect.ticks", TICKS["ant"]), seeds)
-    learnt = {"options.experience": (runs["ant/source"],)}
-    opened = with_options(source, "ant", "open").options
+    from_source = {"options.experience": (runs["ant/source"],)}
+    open_loop = with_options(source, "ant", "open").options
     steering = load_config("ant_steering").options
-    sources = [
-        Cell("ant/source", source, {}, "8"),
-        Cell("ant/source-open", changed(source, {"options": opened} | learnt), {}, "8"),
-        Cell("ant/source-steering", changed(source, {"options": steering} | learnt), {}, "8"),
-    ]
-    config = changed(preset, PLAIN | SCORED | {"seed": FIRST_SEED, "seeds": seeds})
+    sources = [Cell("ant/source", source, {}, "8")]
+    for name, options in (("ant/source-open", open_loop), ("ant/source-steering", steering)):
+        sources.append(Cell(name, replace_all(source, {"options": options} | from_source), {}, "8"))
+    config = replace_all(preset, PLAIN | SCORED | {"seed": FIRST_SEED, "seeds": seeds})
     closed = {"options.source": runs["ant/source-steering"]}
     flat = {"train.ppo": ant.train.ppo}  # no policy over options is trained
+    policy = {"options": ant.options, "options.source": runs["ant/source"]}
     methods = {
         "tuned": closed | {"train.fine_tune": preset.train.fine_tune},
         "flat": flat | {"train.baselines": ("flat",), "options": OptionsConfig()},
-        "transfer": flat
-        | {"train.baselines": ("transfer",), "options": ant.options, "options.source": runs["ant/source"]},
-        "open": {"options": opened, "options.source": runs["ant/source-open"]},
+        "transfer": flat | {"train.baselines": ("transfer",)} | policy,
+        "open": {"options": open_loop, "options.source": runs["ant/source-open"]},
         "closed": closed,
     }
     return sources + [
-        Cell(f"{task}/{name}", changed(config, fields), {name: TRANSFERRED[name][1]}, "8")
+        Cell(f"{task}/{name}", replace_all(config, fields), {name: TRANSFERRED[name][1]}, "8")
         for name, fields in methods.items()
     ]
 
 
 def one_iteration(config: Config, seeds: int) -> Config:
-    """Return the config of a run whose policy over options nobody asks for: of one iteration."""
-    ppo = config.train.ppo
-    ticks = ppo.num_envs * ppo.rollout_length
-    return changed(config, PLAIN | {"train.ticks": ticks, "seed": FIRST_SEED, "seeds": seeds})
+    """Return the config of a source run, whose policy over options is not used: it trains for one iteration."""
+    ticks = config.train.ppo.num_envs * config.train.ppo.rollout_length
+    return replace_all(config, PLAIN | {"train.ticks": ticks, "seed": FIRST_SEED, "seeds": seeds})
 
 
 def recovery(run_dir: Path, seeds: int = 50) -> list[Cell]:
     """Return the runs of figure 5: options of the room, and recovery after it changes."""
     source = one_iteration(load_config("nav2d"), seeds)
     fields = {"options.experience": (str(run_dir / "nav2d/source"),), "seed": FIRST_SEED, "seeds": seeds}
-    change = changed(load_config("nav2d_change"), fields)
+    change = replace_all(load_config("nav2d_change"), fields)
     stages = {method: stage for method, (_, stage) in RECOVERING.items()}
     return [Cell("nav2d/source", source, {PATHS: "options"}, "5"), Cell("nav2d/change", change, stages, "5")]
 
 
 def all_cells(run_dir: Path) -> list[Cell]:
-    """Return every run of every figure, those that others start from before them."""
+    """Return every run of every figure, sources before the runs that start from them."""
     cells = {cell.name: cell for cell in recovery(run_dir)}
     for task in ROBOTS:
         cells |= {cell.name: cell for cell in robots(task, run_dir)}

@@ -1,10 +1,10 @@
-"""Compare rows that were made anew with those of the table: can what the figures show be reproduced?
+"""Compare reproduced rows with those of the table.
 
 python -m taic_jax.experiments.evidence --only walker2d/fixed-open-both --table again.jsonl --run-dir runs/again
 python -m taic_jax.experiments.evidence.reproduce again.jsonl
 
-The same seeds on another machine differ in the last bit, and after some steps in everything: a row comes out again
-where its interquartile mean is within the interval of the committed row.
+The same seeds on another machine differ in the last bit, and after some steps in everything: a row is reproduced if its
+interquartile mean is within the interval of the committed row.
 """
 
 import dataclasses
@@ -23,7 +23,7 @@ from taic_jax.experiments.evidence.measures import PREFIX, has_recovered
 from taic_jax.experiments.evidence.numbers import with_interval, write_numbers
 from taic_jax.experiments.evidence.table import RESULTS, TABLE, EvidenceRows, TableError, read_table, select
 
-# What the figures show of a row, where it has it: heading, and the number per seed.
+# Heading, and the number per seed, of each measure in the figures.
 MEASURES = {
     "untrained": "first",
     "return": "last",
@@ -38,22 +38,16 @@ OURS, THEIRS = ("again", "again_low", "again_high"), ("value", "low", "high")
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
-    """Compare rows that were made anew with those of the table."""
+    """Compare reproduced rows with those of the table."""
 
     again: Annotated[Path, tyro.conf.Positional]
-    """The table of rows made anew, by `evidence --table`."""
-    table: Path = TABLE
-    """The table to compare with."""
-    out: Path = RESULTS / "again.csv"
-    """The comparison."""
+    """The table of the reproduced rows, by `evidence --table`."""
+    table: Path = TABLE  # The table to compare with.
+    out: Path = RESULTS / "again.csv"  # The comparison.
 
 
 def counterpart(row: dict[str, Any], rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Return the row of the same task, method, seeds and config.
-
-    Raises:
-        TableError: there is none.
-    """
+    """Return the row of the same task, method, seeds and config; raise `TableError` if there is none."""
     name = f"{row['task']}/{row['method']}"
     for other in rows:
         if all(row[key] == other[key] for key in ("task", "method", "seed", "seeds")):
@@ -64,7 +58,7 @@ def counterpart(row: dict[str, Any], rows: Sequence[dict[str, Any]]) -> dict[str
 
 
 def compare(ours: EvidenceRows, theirs: EvidenceRows) -> list[dict[str, Any]]:
-    """Return a line per measure: what the table says, what came out again, and whether it is within the interval."""
+    """Return a line per measure: the table's value, the reproduced one, and whether it is within the interval."""
     lines = []
     for measure, name in MEASURES.items():
         if name in theirs.numbers:
@@ -87,7 +81,7 @@ def share(runs: EvidenceRows, names: Sequence[str]) -> dict[str, float]:
 
 
 def write_comparison(arguments: Arguments) -> None:
-    """Write the comparison, and how much of it came out again."""
+    """Write the comparison, and print how much of it was reproduced."""
     committed, fresh = read_table(arguments.table), read_table(arguments.again)
     if not fresh:
         raise TableError(f"{arguments.again}: no rows; python -m taic_jax.experiments.evidence --table makes them")

@@ -1,4 +1,4 @@
-"""Whether codes steer: where an ant goes while one is held, and whether it goes elsewhere under another.
+"""Measure whether codes steer: the way of an ant under one code, and its turn under another.
 
 python -m taic_jax.experiments.evidence.steering RUN... --out FILE
 
@@ -35,9 +35,8 @@ from taic_jax.runtime.run_folder import RunFolder
 from taic_jax.types import as_arrays
 
 CODES, STARTS = 64, 8
-"""Codes of each model, and the starts that each is held from."""
-SECONDS = 3.0
-"""For which a code is held."""
+"""Codes of each model, and starts of each code."""
+SECONDS = 3.0  # Time under one code.
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,40 +44,35 @@ class Arguments:
     """Measure whether the options of runs steer."""
 
     runs: tyro.conf.Positional[tuple[Path, ...]]
-    """Folders of finished runs whose options are of the ant."""
-    out: Path = RESULTS / "steering.csv"
-    """The table of numbers."""
+    """Folders of finished runs with options of the ant."""
+    out: Path = RESULTS / "steering.csv"  # The table of numbers.
 
 
 class Unending(Wrapper):
-    """Goes on after a fall, as the arenas do."""
+    """A task that continues after a fall, as the arenas do."""
 
     def step(self, state: State, action: Float[Array, " A"]) -> State:
-        """Take one tick."""
         return self.env.step(state, action).replace(terminated=jnp.zeros((), bool))
 
 
-def hold(
+def follow(
     env: Env, executor: Executor, begin: RolloutCarry, codes: Float[Array, "N D"], key: Key[Array, ""]
 ) -> tuple[RolloutCarry, Float[Array, "N 2"]]:
-    """Hold a code in each environment, chosen anew whenever its option ends; return what is then, and the way made."""
+    """Choose one code in each environment, again whenever its option ends; return the end and the way to it in m."""
     begin = begin.replace(ended=jnp.ones_like(begin.ended))
     after, _ = rollout(env, executor, partial(always, codes), begin, key, round(SECONDS / env.dt))
     return after, after.env.physics.qpos[:, :2] - begin.env.physics.qpos[:, :2]
 
 
 def walk(env: Env, executor: Executor, key: Key[Array, ""]) -> dict[str, Array]:
-    """Return the ways in m, [CODES, STARTS, 2], `before` codes change, and then under the `same` or a `changed` code.
-
-    `over` [CODES, STARTS] tells whose ants lie on their backs after the change.
-    """
+    """Return the ways in m, [CODES, STARTS, 2], `before` a change of code, and after it under the `same` or a `changed`
+    code; `over` [CODES, STARTS] marks the ants on their backs after the change."""
     key_codes, key_start, key_before, key_after = jax.random.split(key, 4)
     env = AutoReset(Unending(env))
-    drawn = jax.random.normal(key_codes, (2, CODES, executor.option_size))
-    codes, others = jnp.repeat(drawn, STARTS, axis=1)
-    after, before = hold(env, executor, start(env, executor, len(codes), key_start), codes, key_before)
-    _, same = hold(env, executor, after, codes, key_after)
-    last, changed = hold(env, executor, after, others, key_after)
+    codes, others = jnp.repeat(jax.random.normal(key_codes, (2, CODES, executor.option_size)), STARTS, axis=1)
+    after, before = follow(env, executor, start(env, executor, len(codes), key_start), codes, key_before)
+    _, same = follow(env, executor, after, codes, key_after)
+    last, changed = follow(env, executor, after, others, key_after)
     over = jax.vmap(upside_down)(last.env.physics.qpos[:, 3:7])
     ways = {"before": before, "same": same, "changed": changed, "over": over}
     return jax.tree.map(lambda x: x.reshape(CODES, STARTS, *x.shape[1:]), ways)
@@ -93,9 +87,9 @@ def angle(a: Float[np.ndarray, "*batch 2"], b: Float[np.ndarray, "*#batch 2"]) -
 def measure(ways: dict[str, np.ndarray]) -> dict[str, float]:
     """Return the measures of one model's ways.
 
-    Returns: `distance` in m; the share that go `ahead`, within 45 degrees of where the ant faced; the shares that turn
-    by more than 45 degrees under a changed or the same code; the `agreement` of one code's ways from several starts,
-    which is the length of the mean of their unit vectors; and the share that ends `upside_down`.
+    `distance` in m; the share `ahead`, within 45 degrees of the ant's first heading; the shares that turn by more than
+    45 degrees under a changed or the same code; the `agreement` of one code's ways from several starts, the length of
+    the mean of their unit vectors; and the share that ends `upside_down`.
     """
     before = ways["before"]
     distance = np.linalg.norm(before, axis=-1, keepdims=True)
@@ -111,12 +105,8 @@ def measure(ways: dict[str, np.ndarray]) -> dict[str, float]:
 
 
 def steering_of(folder: Path) -> tuple[int, dict[str, np.ndarray]]:
-    """Return the ticks an option lasts at most in a run, and the measures of every seed's model [K].
-
-    Raises:
-      ConfigError: its robot cannot go in every direction.
-      ArtifactError: there are no options.
-    """
+    """Return the most ticks of an option of a run, and the measures of every seed's model [K]; raise `ConfigError` if
+    its robot cannot go in every direction, and `ArtifactError` if there are no options."""
     config = RunFolder(folder).config()
     _, env = make_envs(config)
     robot: Any = getattr(env, "model", None)
@@ -124,13 +114,12 @@ def steering_of(folder: Path) -> tuple[int, dict[str, np.ndarray]]:
         expected = "options of a robot that walks in every direction, as ant"
         raise ConfigError(f"{folder}: expected {expected}, got {env.name}")
     models = load_options(folder, env, config.options, config.seeds)
-    walked = jax.jit(partial(walk, env))  # one program for all seeds
-    measured = []
+    run = jax.jit(partial(walk, env))  # one program for all seeds
+    rows = []
     for seed in range(config.seeds):
-        model = jax.tree.map(lambda x, k=seed: x[k], models)
-        executor = make_executor(as_arrays(config.options), model)
-        measured.append(measure(jax.device_get(walked(executor, jax.random.key(config.seed + seed)))))
-    return config.options.length, {name: np.array([row[name] for row in measured]) for name in measured[0]}
+        executor = make_executor(as_arrays(config.options), jax.tree.map(lambda x, k=seed: x[k], models))
+        rows.append(measure(jax.device_get(run(executor, jax.random.key(config.seed + seed)))))
+    return config.options.length, {name: np.array([row[name] for row in rows]) for name in rows[0]}
 
 
 def write_measures(arguments: Arguments) -> None:

@@ -1,7 +1,7 @@
-"""The table of finished runs, a line of JSON each: what figures are drawn from, and nothing else.
+"""The table of finished runs, a line of JSON each: the only source of the figures.
 
-A row is one method on one task for some seeds: what the run was (config and its hash, versions, commit), a curve per
-seed on a common grid of ticks, and the numbers per seed before and after training; of some an example that is drawn.
+A row is one method on one task for some seeds: config and its hash, versions, commit, a curve per seed on a common grid
+of ticks, the numbers per seed before and after training, and of some an example to draw.
 """
 
 import dataclasses
@@ -21,21 +21,18 @@ from taic_jax.runtime.run_folder import Row, RunFolder
 
 RESULTS = Path("experiments/results")
 TABLE = RESULTS / "evidence.jsonl"
-GRID = 50
-"""Points of a curve, equally far apart; the last is the end of training."""
-EARLIER_DEFAULTS = {"collect.capacity": 1_000_000}
-"""Of fields whose default has changed since the first row."""
-OWN = ("seed", "seeds")
-"""Fields that say which seeds a run has, and not what is run."""
+GRID = 50  # Points of a curve, equally far apart; the last is the end of training.
+EARLIER_DEFAULTS = {"collect.capacity": 1_000_000}  # Fields with another default today.
+OWN = ("seed", "seeds")  # Fields of the seeds alone.
 
 
 class TableError(ValueError):
-    """The table cannot be used as asked."""
+    """The table cannot be used in this way."""
 
 
 @dataclasses.dataclass(frozen=True)
 class EvidenceRows:
-    """One method on one task, of all seeds that the table holds."""
+    """One method on one task, all its seeds in the table."""
 
     task: str
     method: str
@@ -45,41 +42,37 @@ class EvidenceRows:
     grid: np.ndarray  # [G] ticks
     curves: dict[str, np.ndarray]  # [K, G] each
     numbers: dict[str, np.ndarray]  # [K] each; first, last, mean_option, duration, and the task's own
-    remarks: tuple[str, ...]  # what a figure must say of them
+    remarks: tuple[str, ...]  # warnings for a figure
 
 
 def difference(config: Config, run_dir: Path) -> dict[str, Any]:
-    """Return the fields that are not the default, without the seeds; what is taken from others is named in `run_dir`.
+    """Return the fields that are not at their default, without the seeds; other runs by their names in `run_dir`.
 
-    A field that a later version adds is at its default, and so leaves the hash of an earlier run as it was; one whose
-    default was changed is compared with the earlier one. The runs of other seeds take theirs from the runs of those
-    seeds: their names differ in the seed alone, which is left out.
+    A field that a later version adds is at its default, which leaves the hash of an earlier run the same; one whose
+    default has changed is compared with the earlier one. Source runs of other seeds differ in the seed at the end of
+    their name, which is left out.
     """
     default = dict(walk(Config())) | EARLIER_DEFAULTS
     fields = {name: value for name, value in walk(config) if name not in OWN and value != default[name]}
 
-    def named(text: str) -> str:
+    def name_of(text: str) -> str:
         return text.removeprefix(f"{run_dir}/").removesuffix(f"-{config.seed}")
 
     if "options.experience" in fields:
-        fields["options.experience"] = [named(text) for text in fields["options.experience"]]
+        fields["options.experience"] = [name_of(text) for text in fields["options.experience"]]
     if "options.source" in fields:
-        fields["options.source"] = named(fields["options.source"])
+        fields["options.source"] = name_of(fields["options.source"])
     return fields
 
 
 def config_hash(config: Config, run_dir: Path) -> str:
-    """Return twelve digits that tell one config from another, whatever its seeds."""
+    """Return twelve digits that identify a config without its seeds."""
     fields = difference(config, run_dir)
     return hashlib.sha256(json.dumps(fields, sort_keys=True, default=list).encode()).hexdigest()[:12]
 
 
 def read_table(path: Path = TABLE) -> list[dict[str, Any]]:
-    """Return the rows; none where there is no table yet.
-
-    Raises:
-        TableError: a line is no row.
-    """
+    """Return the rows, none if there is no table; raise `TableError` at a line that is no row."""
     if not path.exists():
         return []
     rows = []
@@ -101,14 +94,7 @@ def append_row(path: Path, row: dict[str, Any]) -> None:
 
 
 def row_of(folder: Path, run_dir: Path, method: str, stage: str) -> dict[str, Any]:
-    """Return the row of one method of a finished run.
-
-    Args:
-        folder: of the run.
-        run_dir: the folder that it and what it takes from other runs are in.
-        method: its name in the table.
-        stage: the stage that trained it.
-    """
+    """Return the row of one method of a finished run in a folder of `run_dir`, trained in `stage`."""
     run = RunFolder(folder)
     config, summary = run.config(), run.summary()
     evaluated = summary["methods"]["taic" if stage == "train" else stage]
@@ -120,56 +106,42 @@ def row_of(folder: Path, run_dir: Path, method: str, stage: str) -> dict[str, An
     if config.env.change_after:
         shares, numbers = recovery_of(logged, stage)
         curves["success"] = on_grid(logged, shares, grid).tolist()
-    return {
-        "task": config.env.name,
-        "method": method,
-        "seed": config.seed,
-        "seeds": config.seeds,
-        "ticks": ticks,
-        "pretraining": pretraining_of(config) if stage in ("train", "transfer") else 0,
-        "config": config_hash(config, run_dir),
-        "fields": difference(config, run_dir),
-        "versions": summary["versions"],
-        "commit": summary["commit"],
-        "seconds": round(summary["seconds"]["run"]),
-        "stopped": summary["stopped"].get(stage, {}),
-        "grid": grid.tolist(),
-        "curves": curves,
-        "numbers": {
-            "first": evaluated["return"]["first_per_seed"],
-            "last": evaluated["return"]["per_seed"],
-            "mean_option": evaluated["return_mean_option"]["per_seed"],
-            "duration": evaluated["duration"]["per_seed"],
-            **{name: value["per_seed"] for name, value in evaluated["metrics"].items()},
-            **numbers,
-        },
+    row: dict[str, Any] = {"task": config.env.name, "method": method, "seed": config.seed, "seeds": config.seeds}
+    row |= {"ticks": ticks, "pretraining": pretraining_of(config) if stage in ("train", "transfer") else 0}
+    row |= {"config": config_hash(config, run_dir), "fields": difference(config, run_dir)}
+    row |= {"versions": summary["versions"], "commit": summary["commit"], "seconds": round(summary["seconds"]["run"])}
+    row |= {"stopped": summary["stopped"].get(stage, {}), "grid": grid.tolist(), "curves": curves}
+    row["numbers"] = {
+        "first": evaluated["return"]["first_per_seed"],
+        "last": evaluated["return"]["per_seed"],
+        "mean_option": evaluated["return_mean_option"]["per_seed"],
+        "duration": evaluated["duration"]["per_seed"],
+        **{name: value["per_seed"] for name, value in evaluated["metrics"].items()},
+        **numbers,
     }
+    return row
 
 
 def pretraining_of(config: Config) -> int:
-    """Return the interactions that were spent on what a run takes from others, or on its own experience."""
+    """Return the interactions of the experience or policy that a run starts from, another's or its own."""
     source = config.options.source or next(iter(config.options.experience), "")
     return (RunFolder(Path(source)).config() if source else config).collect.ticks
 
 
 def curves_of(rows: Sequence[Row], stage: str, grid: np.ndarray) -> dict[str, list]:
-    """Return what figures draw of the training [K, G]: the return, and the share of ticks at the goal.
+    """Return the curves of training [K, G]: the return, and the share of ticks at the goal.
 
-    The environments of a run begin their episodes together, and most are at the goal late in them: an iteration is a
-    part of an episode, so the share is a mean over several.
+    That share is a mean over iterations: they are parts of episodes that begin together and reach the goal late.
     """
     names = [name for name in (f"{stage}/return", f"{stage}/mean/success") if name in rows[0]]
     values = {name: np.array([row[name] for row in rows], float).T for name in names}
-    return {
-        name.removeprefix(f"{stage}/"): (mean_on_grid if "mean" in name else on_grid)(rows, value, grid).tolist()
-        for name, value in values.items()
-    }
+    on = {name: mean_on_grid if "mean" in name else on_grid for name in names}
+    return {name.removeprefix(f"{stage}/"): on[name](rows, values[name], grid).tolist() for name in names}
 
 
 def mean_on_grid(rows: Sequence[Row], values: np.ndarray, grid: np.ndarray) -> np.ndarray:
-    """Return values [K, G]: at each point of the grid the mean of those [K, I] of the log's rows in the last two
-    steps of the grid, or the latest where there is none.
-    """
+    """Return at each point of the grid the mean of the values [K, I] of the log's rows in the last two steps of the
+    grid, or the latest where there is none: [K, G]."""
     ticks, means = np.array([row["ticks"] for row in rows]), on_grid(rows, values, grid)
     for g, end in enumerate(grid):
         recent = (ticks <= end) & (ticks > end - 2 * grid[0])
@@ -179,17 +151,14 @@ def mean_on_grid(rows: Sequence[Row], values: np.ndarray, grid: np.ndarray) -> n
 
 
 def on_grid(rows: Sequence[Row], values: np.ndarray, grid: np.ndarray) -> np.ndarray:
-    """Return values [K, G]: at each point of the grid the latest of those [K, I] of the log's rows."""
+    """Return at each point of the grid the latest of the values [K, I] of the log's rows: [K, G]."""
     latest = np.searchsorted([row["ticks"] for row in rows], grid, side="right") - 1
     return np.where(latest >= 0, values[:, np.maximum(latest, 0)], np.nan)
 
 
 def select(rows: Sequence[dict[str, Any]], task: str, method: str, minimum: int = 1) -> EvidenceRows:
-    """Return what the table holds of one method on one task.
-
-    Raises:
-        TableError: nothing, rows of different configs, or one seed twice: what may not be averaged.
-    """
+    """Return the rows of one method on one task as one; raise `TableError` if there are none, several configs, or one
+    seed twice."""
     name = f"{task}/{method}"
     matches = [row for row in rows if (row["task"], row["method"]) == (task, method)]
     if not matches:

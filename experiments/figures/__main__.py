@@ -23,7 +23,7 @@ COMMANDS = {kind.number: kind for kind in (Figure5ab, Figure5c, Figure6, Figure7
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Make what is named, from the table of finished runs alone; return the exit code."""
+    """Make the figure or table of this name from the table of finished runs alone; return the exit code."""
     return tell(lambda: tyro.extras.subcommand_cli_from_dict(COMMANDS, prog=PROGRAM, args=args).make())
 
 

@@ -1,8 +1,7 @@
 """Figures 5a and 5b: interpolation between two options of the room, and one dimension of an option at a time.
 
-The numbers are means over option models with 95 % bootstrap intervals of their interquartile mean: how smoothly
-interpolated codes pass from one path to the other, beside codes of other windows between the same ends; and by how much
-each dimension moves the end point.
+The numbers are interquartile means over option models with 95 % bootstrap intervals: the straightness of interpolated
+codes, beside codes of other windows between the same ends, and the effect of each dimension on the end point.
 """
 
 from collections.abc import Sequence
@@ -29,13 +28,11 @@ class Figure5ab(Figure):
     number = "5ab"
 
     def draw(self, rows: Rows) -> tuple[Picture, Rows]:
-        """Return the picture and its numbers."""
         runs = select(rows, RECOVERY, PATHS, MODELS)
         example = next(row["example"] for row in rows if (row["task"], row["method"]) == (RECOVERY, PATHS))
-        numbers = [
-            {"measure": name, "models": len(values), **with_interval(values), "remarks": "; ".join(runs.remarks)}
-            for name, values in runs.numbers.items()
-        ]
+        numbers, remarks = [], {"remarks": "; ".join(runs.remarks)}
+        for name, values in runs.numbers.items():
+            numbers.append({"measure": name, "models": len(values)} | with_interval(values) | remarks)
         return picture(example, numbers, runs.remarks), numbers
 
 
@@ -53,9 +50,9 @@ def draw_paths(axes: Axes, paths: np.ndarray, originals: np.ndarray, values: np.
 def picture(example: dict[str, Any], rows: Rows, remarks: Sequence[str]) -> Picture:
     """Draw the interpolation, the effect of each dimension, and the numbers."""
     between, paths, swept = (np.array(example[name]) for name in ("between", "interpolated", "swept"))
-    size = len(swept)
+    size, columns = len(swept), (len(swept) + 1) // 2
     figure = plt.figure(figsize=(12.5, 6.6))
-    grid = figure.add_gridspec(2, 2 + (size + 1) // 2, width_ratios=[1.7, 0.8] + [1] * ((size + 1) // 2))
+    grid = figure.add_gridspec(2, 2 + columns, width_ratios=[1.7, 0.8] + [1] * columns)
     left = figure.add_subplot(grid[:, 0])
     draw_paths(left, paths, between, np.arange(len(paths)))
     left.set_ylabel("y in m")
@@ -63,7 +60,7 @@ def picture(example: dict[str, Any], rows: Rows, remarks: Sequence[str]) -> Pict
     left.legend(loc="upper left")
     drawing.mark(left, "a) between two options", remarks)
     for d in range(size):
-        axes = figure.add_subplot(grid[d // ((size + 1) // 2), 2 + d % ((size + 1) // 2)])
+        axes = figure.add_subplot(grid[d // columns, 2 + d % columns])
         draw_paths(axes, swept[d], between[:1], SWEEP)
         axes.set_title(f"b) dimension {d + 1}" if d == 0 else f"dimension {d + 1}", loc="left")
     numbers = {row["measure"]: row for row in rows}

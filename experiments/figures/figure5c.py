@@ -1,6 +1,6 @@
 """Figure 5c: recovery from a sudden change of the room, and the numbers of claim C4.
 
-A seed has recovered where at least 90 % of the last 100 training episodes within 200 000 ticks after the change reach
+A seed has recovered if at least 90 % of the last 100 training episodes within 200 000 ticks after the change reach
 the goal; see `evidence.measures.recovery_of`.
 """
 
@@ -19,8 +19,7 @@ from taic_jax.experiments.figures import drawing
 from taic_jax.experiments.figures.frame import Figure, Rows
 
 SEEDS = 50
-BEFORE = 80_000
-"""Ticks before the change that are drawn."""
+BEFORE = 80_000  # Ticks before the change that are drawn.
 COLOURS = {"options": drawing.RED, "flat": drawing.BLACK}
 
 
@@ -34,7 +33,6 @@ class Figure5c(Figure):
     )  # fmt: skip
 
     def draw(self, rows: Rows) -> tuple[Picture, Rows]:
-        """Return the picture and its numbers."""
         methods = {method: select(rows, RECOVERY, method, SEEDS) for method in RECOVERING}
         lines = [numbers(runs) for runs in methods.values()]
         counts = [(line["recovered"], line["seeds"] - line["recovered"]) for line in lines]
@@ -44,7 +42,7 @@ class Figure5c(Figure):
 
 
 def numbers(runs: EvidenceRows) -> dict[str, Any]:
-    """Return what the table of the figure says of one method."""
+    """Return the numbers of one method."""
     back, learnt = has_recovered(runs.numbers), has_learnt(runs.numbers)
     count, total = int(back.sum()), len(back)
     low, high = exact_interval(count, total)
@@ -58,7 +56,7 @@ def numbers(runs: EvidenceRows) -> dict[str, Any]:
 
 
 def around_the_change(runs: EvidenceRows, grid: np.ndarray) -> np.ndarray:
-    """Return the share of successes [K, G] at ticks counted from each seed's own change; NaN where it never came."""
+    """Return the share of successes [K, G] at ticks from each seed's own change, without the seeds that had none."""
     rows = []
     for curve, at in zip(runs.curves["success"], runs.numbers["changed_at"], strict=True):
         finite = np.isfinite(curve)
@@ -68,7 +66,7 @@ def around_the_change(runs: EvidenceRows, grid: np.ndarray) -> np.ndarray:
 
 
 def picture(methods: dict[str, EvidenceRows], rows: Rows) -> Picture:
-    """Draw the share of successes around the change, and how many seeds recovered."""
+    """Draw the share of successes around the change, and the share of seeds that recovered."""
     figure, (left, right) = plt.subplots(1, 2, figsize=(9.5, 3.8), width_ratios=(3, 1))
     grid = np.linspace(-BEFORE, AFTER, 71)
     for method, runs in methods.items():

@@ -1,8 +1,8 @@
-"""Figure 6: do options that lead to like states have like codes? HalfCheetah, without and with the constraints.
+"""Figure 6: the likeness of options with like effects. HalfCheetah, without and with the constraints.
 
-Needs scikit-learn (extra `viz`). As the paper drew it: a point is an option executed from one state; its place is t-SNE
-of the state that the option led to, its colour t-SNE of the option. t-SNE differs with its perplexity, hence three of
-them; and beside it stand measures of the option spaces themselves, over all option models.
+Needs scikit-learn (extra `viz`). As in the paper, a point is an option executed from one state; its place is t-SNE of
+the state after the option, its colour t-SNE of the option. t-SNE depends on its perplexity, hence three of them; the
+measures of the option spaces, over all option models, are beside it.
 """
 
 import dataclasses
@@ -37,11 +37,9 @@ class Figure6(Figure):
     """Draw figure 6, and write its numbers."""
 
     number = "6"
-    task: str = "half_cheetah"
-    """The robot."""
+    task: str = "half_cheetah"  # The robot.
 
     def draw(self, rows: Rows) -> tuple[Picture, Rows]:
-        """Return the picture and its numbers."""
         rows = [row for row in rows if row["task"] == self.task]
         present = {row["method"] for row in rows}
         methods = {name: select(rows, self.task, name, MODELS) for name in METHODS | OTHERS if name in present}
@@ -62,11 +60,8 @@ def as_colours(points: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 3"]:
 
 
 def embed(points: Any, perplexity: int) -> Float[np.ndarray, "N 2"]:
-    """Return t-SNE of points [N, D] (van der Maaten & Hinton, 2008), begun at their principal components.
-
-    Raises:
-        TableError: scikit-learn is not installed.
-    """
+    """Return t-SNE of points [N, D] (van der Maaten & Hinton, 2008), begun at their principal components; raise
+    `TableError` if scikit-learn is not installed."""
     try:
         from sklearn.manifold import TSNE
     except ImportError:
@@ -75,7 +70,7 @@ def embed(points: Any, perplexity: int) -> Float[np.ndarray, "N 2"]:
 
 
 def numbers(runs: EvidenceRows) -> Rows:
-    """Return a row for each measure of one kind of options: its mean over option models, with a 95 % interval."""
+    """Return a row per measure of one kind of options: its mean over option models, with a 95 % interval."""
     rows = []
     for name, values in runs.numbers.items():
         if name.startswith(PREFIX):
@@ -86,12 +81,12 @@ def numbers(runs: EvidenceRows) -> Rows:
 
 def draw_measure(axes: Axes, name: str, rows: Rows) -> None:
     """Draw one measure of every kind of options, those with the constraints in blue."""
-    shown = [row for row in rows if row["measure"] == name][::-1]
-    for y, row in enumerate(shown):
+    lines = [row for row in rows if row["measure"] == name][::-1]
+    for y, row in enumerate(lines):
         colour = drawing.GREY if row["method"].endswith("none") else drawing.BLUE
         axes.plot([row["low"], row["high"]], [y, y], color=colour, linewidth=2)
         axes.plot(row["iqm"], y, "o", color=colour)
-    axes.set_yticks(range(len(shown)), [row["method"].replace("-", ", ") for row in shown], fontsize=7.5)
+    axes.set_yticks(range(len(lines)), [row["method"].replace("-", ", ") for row in lines], fontsize=7.5)
     axes.set_xlabel(MEASURES[name])
 
 

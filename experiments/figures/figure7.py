@@ -1,6 +1,6 @@
 """Figure 7: learning curves of options and of flat PPO on the robots, and the numbers of claim C2.
 
-A method with fewer seeds than it needs is marked on its panel, as is what is missing.
+A panel names the methods with fewer seeds than planned, and the missing ones.
 """
 
 import dataclasses
@@ -32,13 +32,10 @@ class Figure7(Figure):
         *(f"improvement_of_means{name}{bound}" for name in ("", "_at_same_total") for bound in BOUNDS), "remarks",
     )  # fmt: skip
 
-    tasks: tuple[str, ...] = ROBOTS
-    """Panels."""
-    methods: tuple[str, ...] = tuple(METHODS)
-    """Curves."""
+    tasks: tuple[str, ...] = ROBOTS  # Panels.
+    methods: tuple[str, ...] = tuple(METHODS)  # Curves.
 
     def draw(self, rows: Rows) -> tuple[Picture, Rows]:
-        """Return the picture and its numbers."""
         if unknown := set(self.methods) - set(METHODS):
             raise TableError(f"--methods: expected some of {', '.join(METHODS)}, got {min(unknown)}")
         panels = read_panels(self, rows, self.tasks, {name: METHODS[name] for name in self.methods})
@@ -46,7 +43,7 @@ class Figure7(Figure):
 
 
 def numbers(runs: EvidenceRows, methods: dict[str, EvidenceRows]) -> Rows:
-    """Return what the table of the figure says of one method, in one row, beside flat PPO on the same task."""
+    """Return the numbers of one method, in one row, beside flat PPO on the same task."""
     last, means, curve = runs.numbers["last"], runs.numbers["mean_option"], runs.curves["return"]
     area = np.nanmean(curve, axis=1)
     row = {"task": runs.task, "method": runs.method, "seeds": len(last), "ticks": runs.ticks}
@@ -56,9 +53,7 @@ def numbers(runs: EvidenceRows, methods: dict[str, EvidenceRows]) -> Rows:
     if BASELINE not in methods:
         return [row]
     flat = methods[BASELINE]
-    # Half of what flat PPO ends with, or of what it gains where that is more.
-    threshold = iqm(flat.numbers["last"]) / 2
-    above = curve >= threshold
+    above = curve >= iqm(flat.numbers["last"]) / 2  # the threshold
     first = np.where(above.any(axis=1), runs.grid[above.argmax(axis=1)], np.inf)
     row |= {"ticks_to_threshold": float(np.median(first)), "reached": f"{above.any(axis=1).sum()}/{len(last)}"}
     if runs.method != BASELINE:
@@ -79,18 +74,17 @@ def numbers(runs: EvidenceRows, methods: dict[str, EvidenceRows]) -> Rows:
 
 
 def picture(panels: dict[str, Panel]) -> Picture:
-    """Draw a column per task: over task ticks alone, and with the ticks that options were learnt from counted in."""
+    """Draw a column per task: over the task's ticks alone, and over these and the ticks of pre-training."""
     figure, grid = plt.subplots(2, len(panels), figsize=(4.1 * len(panels) + 0.4, 7.6), squeeze=False)
     for column, (task, (methods, remarks)) in enumerate(panels.items()):
         for row, axes in enumerate(grid[:, column]):
             for method, runs in methods.items():
-                ticks, style = runs.grid + (runs.pretraining if row else 0), (COLOURS[method], METHODS[method][0])
-                drawing.draw_curves(axes, ticks, runs.curves["return"], *style, dashed=method in FLAT)
-                drawing.draw_end(axes, ticks[-1], runs.numbers["mean_option"], COLOURS[method])
+                ticks, ends = runs.grid + (runs.pretraining if row else 0), runs.numbers["mean_option"]
+                style = COLOURS[method], METHODS[method][0], method in FLAT
+                drawing.draw_curves(axes, ticks, runs.curves["return"], style, ends)
             if not methods:
                 drawing.empty(axes)
                 continue
-            axes.set_xlim(left=0)
             drawing.interactions(axes, "interactions, pre-training counted in" if row else "interactions with the task")
         drawing.mark(grid[0, column], task, remarks)
     for axes in grid[:, 0]:

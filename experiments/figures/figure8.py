@@ -1,9 +1,9 @@
 """Figure 8: options of Ant, as they are or fine-tuned, on its harder tasks, and the numbers of claim C3.
 
-A line of numbers is of one measure of one method. Success is to be within 5 m of the goal at the last tick of an
+A row of numbers is of one measure of one method. Success is a place within 5 m of the goal at the last tick of an
 episode (HIRO's definition); a seed's success is its share of evaluation episodes under its mean options.
-`training/success` is a share of ticks. An improvement is the probability that a seed does better than one of a
-baseline, or of options in open loop.
+`training/success` is a share of ticks. An improvement is the probability that a seed is better than one of a baseline,
+or of options in open loop.
 """
 
 import dataclasses
@@ -25,11 +25,9 @@ SEEDS = 10
 COLOURS = {"open": ORANGE, "closed": RED, "tuned": PURPLE, "flat": BLACK, "transfer": BLUE}
 BASELINES = ("flat", "transfer")
 MEASURES = ("first", "last", "mean_option", "final/success", "final/closest_approach", "final/upside_down")
-LATE = 5
-"""Points of a curve, the last ones, whose mean is a measure of training."""
+LATE = 5  # Last points of a curve whose mean is a measure of training.
 CURVES = {"return": "training/return", "mean/success": "training/success"}
-LOWER = ("final/closest_approach", "final/upside_down")
-"""Measures of which less is better."""
+LOWER = ("final/closest_approach", "final/upside_down")  # Measures whose lower values are better.
 COMPARED = (*BASELINES, "open")
 
 
@@ -44,11 +42,9 @@ class Figure8(Figure):
         "p_holm", "seeds_at_goal", "per_seed", "remarks",
     )  # fmt: skip
 
-    tasks: tuple[str, ...] = TRANSFERS
-    """Panels."""
+    tasks: tuple[str, ...] = TRANSFERS  # Panels.
 
     def draw(self, rows: Rows) -> tuple[Picture, Rows]:
-        """Return the picture and its numbers."""
         methods = {name: (label, SEEDS) for name, (label, _) in TRANSFERRED.items()}
         panels = read_panels(self, rows, self.tasks, methods)
         return picture(panels), numbers_of(panels, numbers)
@@ -62,7 +58,7 @@ def measured(runs: EvidenceRows) -> dict[str, np.ndarray]:
 
 
 def at_goal(runs: EvidenceRows, measure: str) -> dict[str, str]:
-    """Return how many seeds are at the goal: in half of the evaluation, or at any time in training."""
+    """Return the number of seeds at the goal: in half of the evaluation, or at any time in training."""
     if measure == "final/success":
         there = runs.numbers[measure] >= 0.5
     elif measure == "training/success":
@@ -73,7 +69,7 @@ def at_goal(runs: EvidenceRows, measure: str) -> dict[str, str]:
 
 
 def numbers(runs: EvidenceRows, methods: dict[str, EvidenceRows]) -> Rows:
-    """Return what the table of the figure says of one method, a row per measure; p is of the worse comparison."""
+    """Return the numbers of one method, a row per measure; p is of the worse comparison."""
     rows, others = [], {name: measured(methods[name]) for name in COMPARED if name in methods}
     for measure, values in measured(runs).items():
         row: dict[str, Any] = {"task": runs.task, "method": runs.method, "measure": measure, "seeds": len(values)}
@@ -91,7 +87,7 @@ def numbers(runs: EvidenceRows, methods: dict[str, EvidenceRows]) -> Rows:
 
 
 def picture(panels: dict[str, Panel]) -> Picture:
-    """Draw a column per task: the return, and where there is a goal the share of ticks spent at it."""
+    """Draw a column per task: the return, and the share of ticks at the goal if there is one."""
     goals = any("mean/success" in runs.curves for panel in panels.values() for runs in panel.methods.values())
     names = ("return", "mean/success")[: 1 + goals]
     size = 4.1 * len(panels) + 0.4, 3.0 * len(names) + 1.0
@@ -100,12 +96,10 @@ def picture(panels: dict[str, Panel]) -> Picture:
         for axes, name in zip(grid[:, column], names, strict=True):
             curves = {method: runs for method, runs in methods.items() if name in runs.curves}
             for method, runs in curves.items():
-                style = COLOURS[method], TRANSFERRED[method][0]
-                drawing.draw_curves(axes, runs.grid, runs.curves[name], *style, dashed=method in BASELINES)
-                if name == "return":
-                    drawing.draw_end(axes, runs.grid[-1], runs.numbers["mean_option"], COLOURS[method])
+                style = COLOURS[method], TRANSFERRED[method][0], method in BASELINES
+                ends = runs.numbers["mean_option"] if name == "return" else None
+                drawing.draw_curves(axes, runs.grid, runs.curves[name], style, ends)
             if curves:
-                axes.set_xlim(left=0)
                 drawing.interactions(axes, "interactions with the task")
             elif methods:
                 axes.set_axis_off()

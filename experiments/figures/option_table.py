@@ -1,4 +1,4 @@
-"""One table of every kind of options on every robot: returns, durations, and measures of the option space."""
+"""The table of every kind of options on every robot: returns, durations, and measures of the option space."""
 
 import dataclasses
 from pathlib import Path
@@ -13,7 +13,7 @@ from taic_jax.experiments.evidence.table import RESULTS, TABLE, EvidenceRows, Ta
 from taic_jax.experiments.figures.frame import read_methods
 from taic_jax.runtime.files import save_text
 
-# Heading, and the number per seed that stands below it.
+# Heading, and the number per seed below it.
 COLUMNS = {
     "untrained": "first",
     "return": "last",
@@ -41,10 +41,8 @@ Made by `python -m taic_jax.experiments.figures table`.
 class OptionTable:
     """Write the table of all kinds of options."""
 
-    table: Path = TABLE
-    """The table of finished runs."""
-    out: Path = RESULTS / "options.md"
-    """The file, in Markdown."""
+    table: Path = TABLE  # The table of finished runs.
+    out: Path = RESULTS / "options.md"  # The file, in Markdown.
 
     def make(self) -> None:
         """Write the table."""
@@ -69,7 +67,7 @@ def kind(method: str) -> list[str]:
 
 
 def cell(values: np.ndarray | None) -> str:
-    """Return an interquartile mean with its interval, to three digits or whole numbers; nothing where there is none."""
+    """Return an interquartile mean with its interval, to two digits or whole numbers; an empty text without values."""
     if values is None:
         return ""
     mean, low, high = (f"{x:.0f}" if abs(x) >= 100 else f"{x:.2g}" for x in with_interval(values).values())

@@ -1,1 +1,1 @@
-"""Runs that are killed, and runs that are left alone: what they leave, and whether they go on."""
+"""Tests of reliability: runs that are killed and resumed, and runs of many hours."""

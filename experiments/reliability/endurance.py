@@ -1,4 +1,4 @@
-"""Leave a run alone for hours, watch its memory and whether it goes on, and stop it as a user would.
+"""Watch the memory and the progress of a run for hours, and stop it as a user would.
 
 python -m taic_jax.experiments.reliability.endurance --hours 2 ant --seeds 10 --run-dir runs/long
 
@@ -22,8 +22,7 @@ import tyro
 from taic_jax.runtime.run_folder import RunFolder
 
 POLL = 5.0
-SETTLED = 0.2
-"""Share of a stage, at its start and at its end, whose medians are compared."""
+SETTLED = 0.2  # Share of a stage's samples in each of the two medians that are compared.
 
 
 class Sample(NamedTuple):
@@ -37,13 +36,13 @@ class Sample(NamedTuple):
 
 @dataclass(frozen=True)
 class Arguments:
-    """Watch a run, whose config and options follow, --run-dir among them; exit code 1 if it failed."""
+    """Watch a run with the config and options that follow, --run-dir among them; exit code 1 if it fails."""
 
     hours: float = 2.0  # After which it is stopped.
 
 
 def watch(process: subprocess.Popen, run: RunFolder, seconds: float, poll: float = POLL) -> tuple[list[Sample], int]:
-    """Stop a run by SIGTERM after so many seconds, and return samples of it and its exit code."""
+    """Stop a run by SIGTERM after so many seconds, and return its samples and its exit code."""
     samples, begun = [], time.monotonic()
     with process:
         while process.poll() is None:
@@ -60,24 +59,22 @@ def watch(process: subprocess.Popen, run: RunFolder, seconds: float, poll: float
 
 
 def growth(samples: Sequence[Sample]) -> float:
-    """Return by what share memory is greater in the last fifth of the samples of a stage than in the second.
-
-    In the first fifth it is compiled, and buffers are made.
-    """
+    """Return the growth of memory, as a share, from the second fifth of a stage's samples to the last; in the first
+    fifth JAX compiles, and allocates buffers."""
     part = max(int(len(samples) * SETTLED), 1)
     early, late = samples[part : 2 * part] or samples[:1], samples[-part:]
     return statistics.median(s.mib for s in late) / statistics.median(s.mib for s in early) - 1
 
 
 def longest_silence(samples: Sequence[Sample]) -> float:
-    """Return the most seconds in which no row was added, after the first was."""
+    """Return the most seconds between two rows, or from the last row to the end."""
     added = [after.seconds for before, after in itertools.pairwise(samples) if after.rows != before.rows]
     times = [samples[0].seconds, *added, samples[-1].seconds]
     return max(after - before for before, after in itertools.pairwise(times))
 
 
 def report(samples: Sequence[Sample], code: int) -> None:
-    """Print a line a stage, and one on the whole."""
+    """Print a line per stage, and one on the whole run."""
     for stage in dict.fromkeys(sample.stage for sample in samples):
         of_stage = [sample for sample in samples if sample.stage == stage]
         first, last = of_stage[0], of_stage[-1]
@@ -87,7 +84,7 @@ def report(samples: Sequence[Sample], code: int) -> None:
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Watch a run and report; return 1 unless it ended by itself or was stopped in time."""
+    """Watch a run and report; return 1 unless it ended by itself or by our signal."""
     arguments, run = tyro.cli(Arguments, args=args, return_unknown_args=True)
     if "--run-dir" not in run[:-1]:
         print("endurance: expected --run-dir DIR among the options of the run", file=sys.stderr)

@@ -1,9 +1,9 @@
-"""Kill runs at random moments, resume them, and compare each with a run that was left alone, bit by bit.
+"""Kill runs at random moments, resume them, and compare each with an uninterrupted run, bit by bit.
 
 python -m taic_jax.experiments.reliability.kills --kills 50
 
 Each is killed once by SIGKILL, at a moment drawn uniformly over the length of a whole run with a whole sweep after it,
-start and compilation included. Compiled programs are cached, so that a run is mostly what is tested.
+start and compilation included. Compiled programs are cached, so that most moments are within a stage.
 """
 
 import contextlib
@@ -31,7 +31,7 @@ from taic_jax.runtime.checkpoint import load_arrays
 from taic_jax.runtime.run_folder import RunFolder
 
 POINTS = ("--axes", "train.ppo.learning_rate=3e-4,1e-3", "--chunk", "1")
-"""Of the sweep: a chunk, that is a whole run, for each."""
+"""Options of the sweep: two points, each a chunk of its own, which is a whole run."""
 SMALL = PPOConfig(num_envs=4, rollout_length=64, epochs=2, minibatch_size=64, hidden_sizes=(16,))
 
 
@@ -61,11 +61,8 @@ def config(arguments: Arguments) -> Config:
 
 
 def execute(folder: Path, kind: str, source: str, seconds: float | None = None) -> None:
-    """Execute a run or a sweep, which keeps its compiled programs beside the folder; kill it after so many seconds.
-
-    Raises:
-      RuntimeError: it failed.
-    """
+    """Execute a run or a sweep with the program cache beside its folder, and kill it after so many seconds; raise
+    `RuntimeError` if it fails."""
     cache = {"JAX_COMPILATION_CACHE_DIR": str(folder.parent / "compiled")}
     cache |= {"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
     command = [sys.executable, "-W", "ignore", "-m", f"taic_jax.{kind}", source, "--run-dir", str(folder)]
@@ -77,26 +74,23 @@ def execute(folder: Path, kind: str, source: str, seconds: float | None = None) 
 
 
 def outcome(folder: Path) -> dict[str, Any]:
-    """Return all that a run or a sweep leaves and that must not depend on interruptions, by name."""
+    """Return by name all results of a run or a sweep that must not depend on interruptions."""
     run = RunFolder(folder)
     if not run.finished:
         chunks = {f"{path.name}/{name}": x for path in folder.glob("chunk-*") for name, x in outcome(path).items()}
         return chunks | {name: (folder / name).read_bytes() for name in ("table.csv", "best.yaml", "plan.json")}
     summary = run.summary()
     rows = [{k: v for k, v in row.items() if k != "time"} for row in run.metrics()]
-    rows.sort(key=lambda row: row["stage"])  # a resumed run repeats an evaluation, later than it was
+    rows.sort(key=lambda row: row["stage"])  # a resumed run repeats an evaluation at another place
     return {"methods": summary["methods"], "ticks": summary["ticks"], "rows": rows, **dict(_arrays(folder))}
 
 
 def _arrays(folder: Path) -> Iterator[tuple[str, bytes]]:
     for path in folder.rglob("*"):
+        arrays = load_arrays(path) if (path / "_CHECKPOINT_METADATA").is_file() else {}
         if path.suffix == ".npz":
             with np.load(path) as file:
                 arrays = dict(file)
-        elif (path / "_CHECKPOINT_METADATA").is_file():
-            arrays = load_arrays(path)
-        else:
-            continue
         yield from ((f"{path.relative_to(folder)}/{name}", array.tobytes()) for name, array in arrays.items())
 
 
@@ -106,7 +100,7 @@ def differences(a: dict[str, Any], b: dict[str, Any]) -> list[str]:
 
 
 def kill_one(folder: Path, kind: str, source: str, seconds: float) -> str:
-    """Kill a run or a sweep after so many seconds, finish it, and return the stage of the run it was killed in."""
+    """Kill a run or a sweep after so many seconds, finish it, and return the stage in which it was killed."""
     execute(folder, kind, source, seconds)
     run = RunFolder(folder)
     rows = run.metrics() if run.metrics_path.is_file() else []
@@ -116,7 +110,7 @@ def kill_one(folder: Path, kind: str, source: str, seconds: float) -> str:
 
 
 def kill_all(arguments: Arguments, root: Path) -> Iterator[tuple[str, float, list[str]]]:
-    """Yield of each run the stage it was killed in, after how many seconds, and what then differs from a whole run."""
+    """Yield for each run the stage and the seconds at which it was killed, and the differences from a whole run."""
     source = str(root / "config.yaml")
     Path(source).write_text(to_yaml(config(arguments)))
     execute(root / "warm", "run", source)  # fills the cache
@@ -126,15 +120,14 @@ def kill_all(arguments: Arguments, root: Path) -> Iterator[tuple[str, float, lis
         times.append(time.perf_counter())
     expected = {kind: outcome(root / kind) for kind in ("run", "sweep")}
     run, sweep = np.diff(times)
-    moments = random.Random(arguments.seed)
-    drawn = [moments.uniform(-run, sweep) for _ in range(arguments.kills)]
-    kinds = ["sweep" if moment > 0 else "run" for moment in drawn]
-    seconds = [moment if moment > 0 else moment + run for moment in drawn]
+    generator = random.Random(arguments.seed)
+    moments = [generator.uniform(-run, sweep) for _ in range(arguments.kills)]
+    kills = [("sweep", moment) if moment > 0 else ("run", moment + run) for moment in moments]
     folders = [root / str(i) for i in range(arguments.kills)]
     with ThreadPoolExecutor(arguments.jobs) as pool:
-        stages = pool.map(kill_one, folders, kinds, [source] * arguments.kills, seconds)
-        for stage, kind, moment, folder in zip(stages, kinds, seconds, folders, strict=True):
-            yield stage, moment, differences(expected[kind], outcome(folder))
+        stages = pool.map(lambda folder, kill: kill_one(folder, kill[0], source, kill[1]), folders, kills)
+        for stage, (kind, seconds), folder in zip(stages, kills, folders, strict=True):
+            yield stage, seconds, differences(expected[kind], outcome(folder))
             shutil.rmtree(folder)
 
 

@@ -1,11 +1,11 @@
 """Other libraries' PPO at the work of ours, on Gymnasium's own models; each is imported when it is made.
 
-A peer is a callable that trains for one iteration, and counts its `ticks` and `gradient_steps`.
+A call of a peer trains for one iteration; `ticks` are those of a call, `gradient_steps` those so far.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 from taic_jax.config import PPOConfig
 from taic_jax.envs.adapters.admission import extra
@@ -14,7 +14,7 @@ from taic_jax.envs.physics.mujoco import num_physical_cores
 from taic_jax.experiments.benchmark.peers.brax_ppo import DoesNotRunError, ticks_per_second
 from taic_jax.experiments.benchmark.timing import seconds
 
-# Where our own ant leaves something out, theirs does too: observations of contact forces (78 entries, all but zero).
+# Our own ant has no observations of contact forces (78 entries, all but zero); theirs leaves them out too.
 GYMNASIUM: dict[str, tuple[str, dict[str, Any]]] = {
     "half_cheetah": ("HalfCheetah-v5", {}),
     "ant": ("Ant-v5", {"include_cfrc_ext_in_observation": False, "contact_cost_weight": 0.0}),
@@ -24,57 +24,47 @@ BRAX = {"half_cheetah": "halfcheetah", "ant": "ant"}
 NO_TASK = "has no such task"
 
 
-class Tuned(NamedTuple):
-    """The fastest of a peer's settings, and which it is."""
+def fastest(make: Callable[[int], Any], counts: Iterable[int]) -> tuple[Any, str]:
+    """Make a peer with each number of threads, time its second iteration, and close all but the fastest.
 
-    peer: Any
-    setting: str
-
-
-def fastest(make: Callable[[int], Any], counts: Iterable[int]) -> Tuned:
-    """Make a peer with each number of threads, warm it up, measure an iteration, and close all but the fastest."""
-    best, least = None, float("inf")
+    Return that one and its setting.
+    """
+    best, least, setting = None, float("inf"), ""
     for threads in counts:
         peer = make(threads)
         peer()
         taken = seconds(peer)
         if taken < least:
-            best, peer, least = Tuned(peer, f"{threads} threads"), best and best.peer, taken
+            best, peer, least, setting = peer, best, taken, f"{threads} threads"
         if peer is not None:
             peer.close()
-    assert best, "there is at least one candidate"
-    return best
+    return best, setting
 
 
-def _stable_baselines(task: str, config: PPOConfig, threads: int) -> Any:
-    """Make Stable-Baselines3's PPO, in one process: with one per environment, 64 do not fit in 24 GiB."""
+def _make(name: str, task: str, config: PPOConfig, threads: int) -> Any:
+    """Make a peer: of Stable-Baselines3 in one process, for with one per environment 64 do not fit in 24 GiB."""
     with extra("peers"):
-        from taic_jax.experiments.benchmark.peers.stable_baselines import StableBaselines
-    return StableBaselines(*GYMNASIUM[task], config, threads)
+        if name == "stable_baselines3":
+            from taic_jax.experiments.benchmark.peers.stable_baselines import StableBaselines
 
-
-def _envpool(task: str, config: PPOConfig, threads: int) -> Any:
-    """Make a PPO in PyTorch on EnvPool, which itself has a thread a core."""
-    with extra("peers"):
+            return StableBaselines(*GYMNASIUM[task], config, threads)
         from taic_jax.experiments.benchmark.peers.pytorch_ppo import EnvPoolPPO
-    return EnvPoolPPO(ENVPOOL[task], config, num_physical_cores(), threads)
+
+        return EnvPoolPPO(ENVPOOL[task], config, num_physical_cores(), threads)
 
 
-PEERS: Mapping[str, tuple[Mapping[str, Any], Callable[[str, PPOConfig, int], Any]]] = {
-    "stable_baselines3": (GYMNASIUM, _stable_baselines),
-    "envpool_pytorch": (ENVPOOL, _envpool),
-}
+PEERS: Mapping[str, Mapping[str, Any]] = {"stable_baselines3": GYMNASIUM, "envpool_pytorch": ENVPOOL}
 
 
 def loops(task: str, config: PPOConfig) -> tuple[dict[str, Any], dict[str, str]]:
-    """Return the peers that run here, and a remark on each: its setting, or why it does not run."""
+    """Return the peers that run here, and a remark on each: its setting, or the reason why it does not run."""
     running, remarks, counts = {}, {}, sorted({1, num_physical_cores()})
-    for name, (tasks, make) in PEERS.items():
+    for name, tasks in PEERS.items():
         if task not in tasks:
             remarks[name] = NO_TASK
             continue
         try:
-            running[name], remarks[name] = fastest(partial(make, task, config), counts)
+            running[name], remarks[name] = fastest(partial(_make, name, task, config), counts)
         except MissingExtraError as error:
             remarks[name] = str(error)
     return running, remarks

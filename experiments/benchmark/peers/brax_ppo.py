@@ -16,8 +16,7 @@ from taic_jax.envs.third_party import third_party
 Pipeline = Literal["spring", "positional", "generalized", "mjx"]
 """Brax's engines, from the simplest physics to MuJoCo's."""
 PIPELINES: tuple[Pipeline, ...] = get_args(Pipeline)
-ITERATIONS = 3
-"""After the first, which compiles."""
+ITERATIONS = 3  # After the first, which compiles.
 
 
 class DoesNotRunError(Exception):
@@ -27,11 +26,11 @@ class DoesNotRunError(Exception):
 def ticks_per_second(name: str, pipeline: str, config: PPOConfig) -> list[float]:
     """Train with Brax and return the ticks per second of each iteration but the first, which compiles.
 
-    One function that it calls and JAX no longer has is put back for it. Its loop cannot be entered from outside, so
-    that it takes no turns with others.
+    A function that Brax calls and JAX no longer has is put back. Brax's loop cannot be entered from outside: it takes
+    no turns with others.
 
     Raises:
-      DoesNotRunError: it raises, whatever it is: Brax's trainer is older than this JAX.
+      DoesNotRunError: Brax's trainer, which is older than this JAX, raises any error.
     """
     times = [time.perf_counter()]
     ticks, sizes = config.num_envs * config.rollout_length, tuple(config.hidden_sizes)

@@ -1,5 +1,6 @@
 """A plain PPO in PyTorch on EnvPool, as people write it; imports both."""
 
+import itertools
 from typing import Any
 
 import envpool
@@ -12,10 +13,7 @@ from taic_jax.config import PPOConfig
 
 
 class EnvPoolPPO:
-    """Train on EnvPool, which has threads of its own, an iteration a call; observations and rewards as they come.
-
-    That costs less than to normalise them.
-    """
+    """PPO on EnvPool, which has threads of its own; observations and rewards are not normalised, which costs less."""
 
     def __init__(self, name: str, config: PPOConfig, env_threads: int, threads: int):
         self.ticks, self._threads, self._config = config.num_envs * config.rollout_length, threads, config
@@ -30,7 +28,7 @@ class EnvPoolPPO:
         self.made = self.gradient_steps = 0
 
     def __call__(self) -> None:
-        """Train for one iteration more."""
+        """Train for one iteration."""
         torch.set_num_threads(self._threads)
         self._update(self._rollout())
 
@@ -87,14 +85,10 @@ class EnvPoolPPO:
 
 
 def _mlp(size: int, hidden_sizes: tuple[int, ...], outputs: int, scale: float) -> nn.Sequential:
-    layers, sizes = [], (size, *hidden_sizes)
-    for i in range(len(hidden_sizes)):
-        layers += [_linear(sizes[i], sizes[i + 1], 2**0.5), nn.Tanh()]
-    return nn.Sequential(*layers, _linear(sizes[-1], outputs, scale))
-
-
-def _linear(inputs: int, outputs: int, scale: float) -> nn.Linear:
-    layer = nn.Linear(inputs, outputs)
-    nn.init.orthogonal_(layer.weight, scale)
-    nn.init.zeros_(layer.bias)
-    return layer
+    layers, gains = [], [2**0.5] * len(hidden_sizes) + [scale]
+    for (inputs, width), gain in zip(itertools.pairwise((size, *hidden_sizes, outputs)), gains, strict=True):
+        layer = nn.Linear(inputs, width)
+        nn.init.orthogonal_(layer.weight, gain)
+        nn.init.zeros_(layer.bias)
+        layers += [layer, nn.Tanh()]
+    return nn.Sequential(*layers[:-1])

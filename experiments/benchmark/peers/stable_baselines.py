@@ -11,7 +11,7 @@ from taic_jax.config import PPOConfig
 
 
 class StableBaselines:
-    """Train with Stable-Baselines3, an iteration a call; observations and rewards as they come, which costs less.
+    """PPO of Stable-Baselines3; observations and rewards are not normalised, which costs less.
 
     The environment's name and options are those of `gymnasium.make`, the threads PyTorch's.
     """
@@ -29,18 +29,18 @@ class StableBaselines:
         )  # fmt: skip
 
     def __call__(self) -> None:
-        """Train for one iteration more."""
+        """Train for one iteration."""
         torch.set_num_threads(self._threads)
         self._model.learn(self.ticks, reset_num_timesteps=False)
 
     @property
     def made(self) -> int:
-        """How many ticks it has made so far."""
+        """Ticks so far."""
         return self._model.num_timesteps
 
     @property
     def gradient_steps(self) -> int:
-        """How many gradient steps it has taken so far."""
+        """Gradient steps so far."""
         states = self._model.policy.optimizer.state.values()
         return max((int(state["step"]) for state in states), default=0)
 
