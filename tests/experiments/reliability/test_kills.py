@@ -8,8 +8,8 @@ from taic_jax.experiments.reliability import kills
 
 
 @pytest.mark.timeout(1200)
-def test_three_killed_runs_end_as_if_they_had_not_been(monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", ["kills", "--kills", "3", "--iterations", "4", "--seeds", "1", "--jobs", "2"])
+def test_five_killed_runs_end_as_if_they_had_not_been(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["kills", "--kills", "5", "--iterations", "4", "--seeds", "1", "--jobs", "2"])
     assert kills.main() == 0
     out = capsys.readouterr().out
     assert "5 resumed runs identical, 0 not" in out and " in sweep" in out
