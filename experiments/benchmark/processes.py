@@ -45,21 +45,17 @@ def _next_iteration(task: str, folder: Path, run_dir: Path, *options: str) -> fl
     environment = {key: value for key, value in os.environ.items() if not key.startswith("JAX_COMPILATION_CACHE")}
     environment |= {"XDG_CACHE_HOME": str(folder / "cache")}
     command = [sys.executable, "-m", "taic_jax.run", task, "--run-dir", str(run_dir), *options]
-    before, begun = _rows(run_dir), time.perf_counter()
+    run = RunFolder(run_dir)
+    before, begun = len(run.metrics()), time.perf_counter()
     with subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
         try:
-            while _rows(run_dir) <= before:
+            while len(run.metrics()) <= before:
                 if process.poll() is not None or time.perf_counter() - begun > PATIENCE:
                     raise RuntimeError(f"{' '.join(command)} logged nothing: exit code {process.poll()}")
                 time.sleep(POLL)
             return time.perf_counter() - begun
         finally:
             process.terminate()
-
-
-def _rows(run_dir: Path) -> int:
-    run = RunFolder(run_dir)
-    return len(run.metrics()) if run.metrics_path.is_file() else 0
 
 
 class SeedsApart:

@@ -48,7 +48,7 @@ def watch(process: subprocess.Popen, run: RunFolder, seconds: float, poll: float
         while process.poll() is None:
             time.sleep(poll)
             passed = time.monotonic() - begun
-            rows = run.metrics() if run.metrics_path.is_file() else []
+            rows = run.metrics()
             with contextlib.suppress(psutil.Error):  # it has ended
                 if size := psutil.Process(process.pid).memory_info().rss:
                     samples.append(Sample(passed, rows[-1]["stage"] if rows else "start", len(rows), size / 2**20))

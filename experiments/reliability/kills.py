@@ -103,7 +103,7 @@ def kill_one(folder: Path, kind: str, source: str, seconds: float) -> str:
     """Kill a run or a sweep after so many seconds, finish it, and return the stage in which it was killed."""
     execute(folder, kind, source, seconds)
     run = RunFolder(folder)
-    rows = run.metrics() if run.metrics_path.is_file() else []
+    rows = run.metrics()
     stage = "end" if run.finished else rows[-1]["stage"] if rows else "start"
     execute(folder, kind, "--resume" if run.begun else source)
     return "sweep" if kind == "sweep" else stage

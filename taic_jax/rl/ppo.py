@@ -102,7 +102,7 @@ def _standardize(x: Float[Array, " R"], mask: Array) -> Float[Array, " R"]:
 def iterate(
     config: PPOConfig, env: Env, executor: Executor, num_iterations: int, state: TrainState
 ) -> tuple[TrainState, dict[str, Array], Rollout, Judgement]:
-    """Run one iteration: collect T ticks of B environments, evaluate them, then update the policy in epochs.
+    """Run one iteration: collect T ticks of B environments, judge them, then update the policy in epochs.
 
     Returns the next state, the iteration's metrics, the rollout (unscaled rewards) and its judgement.
     """

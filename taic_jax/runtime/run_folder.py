@@ -116,7 +116,9 @@ class RunFolder:
         return json.loads(self.summary_path.read_text())
 
     def metrics(self, stage: str | None = None) -> list[Row]:
-        """Read the rows of one stage, or of all, without an incomplete last one."""
+        """Read the rows of one stage, or of all, without an incomplete last one; none before the first is written."""
+        if not self.metrics_path.is_file():
+            return []
         lines = self.metrics_path.read_text().splitlines(keepends=True)
         rows = [json.loads(line) for line in lines if line.endswith("\n")]
         return [row for row in rows if stage in (None, row["stage"])]
