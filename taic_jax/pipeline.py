@@ -38,6 +38,7 @@ from taic_jax.runtime.run_folder import RunFolder, Summary
 from taic_jax.summary import as_summary, write_video
 from taic_jax.trainer import (
     Trained,
+    agents_of_rows,
     assess_rows,
     init_learning,
     init_rows,
@@ -187,29 +188,29 @@ def _train(
 
     A policy that begins from another one still explores anew, with the config's standard deviation.
     """
-    trainer, keys = make_trainer(stage, run.config, env, model), run.stage_keys(stage)
-    state = jax.jit(init_rows)(trainer, keys)
+    make, rows, keys = partial(make_trainer, stage, env), (run.config, model), run.stage_keys(stage)
+    state = jax.jit(partial(init_rows, make))(rows, keys)
     if begin:
         params = begin[0].replace(log_std=state.params.log_std)
         state = state.replace(params=params, obs_statistics=begin[1])
-    compiled = _compile_rows(run, stage, assess_rows, trainer, run.stage_keys("evaluate"), state)
+    compiled = _compile_rows(run, stage, partial(assess_rows, make), rows, run.stage_keys("evaluate"), state)
 
     def assess(state: Any) -> dict:
         with run.logger.doing(f"{stage}: evaluating"):
-            return jax.device_get(compiled(trainer, run.stage_keys("evaluate"), state))
+            return jax.device_get(compiled(rows, run.stage_keys("evaluate"), state))
 
     first = assess(state)
-    step, population = step_rows, run.population if stage == "train" else None
+    trainer, step, population = make(*rows), partial(step_rows, make), run.population if stage == "train" else None
     if population:
         state, step = population.begin(state, run.config, keys), population.evolving(step)
     state = drive(
-        run, stage, step, state, trainer,
+        run, stage, step, state, rows,
         num_steps=trainer.num_steps, unit=trainer.unit, ticks=trainer.unit * len(keys), after=after,
     )  # fmt: skip
     state = state.state if population else state
     last = _without_stopped(assess(state), run.stopped[stage].code != FINITE)
     run.logger.log("evaluate", trainer.ticks, {f"{stage}/{name}": x["return"] for name, x in last.items()})
-    return Trained(jax.vmap(lambda one, state: one.agent(state))(trainer, state), first, last)
+    return Trained(agents_of_rows(make, rows, state), first, last)
 
 
 def _compile_rows(run: Run, stage: str, function: Callable[..., Any], *args: Any) -> Callable[..., Any]:

@@ -58,8 +58,9 @@ def _stage(run: Run, env: Env, source: Env, stage: str) -> tuple[Any, Any, tuple
         return learn_rows, states, (config.options, select_windows(run, source))
     folder = Path(config.options.source or run.dir)
     model = load_options(folder, env, config.options, len(keys)) if stage == "train" else None
-    trainer = make_trainer(stage, config, source if stage == COLLECT else env, model)
-    return step_rows, jax.eval_shape(init_rows, trainer, keys), (trainer,)
+    make = partial(make_trainer, stage, source if stage == COLLECT else env)
+    states = jax.eval_shape(partial(init_rows, make), (config, model), keys)
+    return partial(step_rows, make), states, ((config, model),)
 
 
 def _read(dump: Path) -> dict[str, Any]:

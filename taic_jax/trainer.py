@@ -1,11 +1,12 @@
 """One step of a stage: training of a policy on a task, or learning of options; both vmapped over rows of configs."""
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from flax import struct
 from jaxtyping import Array
 
 from taic_jax.analysis.evaluate import evaluate
@@ -23,14 +24,15 @@ from taic_jax.rl.fine_tune import Tuned
 STEPS_PER_LOG = 100
 
 
-class Trainer(struct.PyTreeNode):
+@dataclass(frozen=True)
+class Trainer:
     """Flat PPO, configured by `collect.ppo`; options are actions, each applied for `hold` ticks."""
 
+    env: Env
     config: Config
+    ticks: int
+    hold: int = 1
     model: OptionModel | None = None
-    env: Env = struct.field(pytree_node=False, kw_only=True)
-    ticks: int = struct.field(pytree_node=False, kw_only=True)
-    hold: int = struct.field(pytree_node=False, default=1, kw_only=True)
 
     @property
     def settings(self) -> PPOConfig:
@@ -107,29 +109,42 @@ class FineTuneTrainer(OptionTrainer):
         return ppo.as_agent(self.settings, fine_tune.tuned_executor(self.executor, tuned.decoder), policy)
 
 
-def make_trainer(stage: str, config: Config, env: Env, model: OptionModel | None = None) -> Trainer:
+Row = tuple[Config, OptionModel | None]
+"""The arrays that set one trainer apart from another of its stage; rows [K] have a leading axis."""
+
+
+def make_trainer(stage: str, env: Env, config: Config, model: OptionModel | None = None) -> Trainer:
     """Return the trainer of a stage: `collect`, `train` over a model's options, or one of `train.baselines`."""
     if model is not None:
         kind = FineTuneTrainer if config.train.fine_tune.epochs else OptionTrainer
-        return kind(config, model, env=env, ticks=config.train.ticks)
+        return kind(env, config, config.train.ticks, model=model)
     ticks = {COLLECT: config.collect.ticks, "total": config.collect.ticks + config.train.ticks}
     hold = config.options.length if stage == "repeat" else 1
-    return Trainer(config, env=env, ticks=ticks.get(stage, config.train.ticks), hold=hold)
+    return Trainer(env, config, ticks.get(stage, config.train.ticks), hold)
 
 
-def init_rows(trainer: Trainer, keys: Array) -> Any:
-    """Return the states [K] of untrained policies, of a trainer with leading axis K."""
-    return jax.vmap(lambda one, key: one.init(key))(trainer, keys)
+# A trainer is made within the program that uses it: as an argument it would put its environment into JAX's caches,
+# which outlive the run. `make` is `make_trainer` of a stage and an environment.
 
 
-def step_rows(states: Any, trainer: Trainer) -> tuple[Any, dict, Any]:
+def init_rows(make: Callable[..., Trainer], rows: Row, keys: Array) -> Any:
+    """Return the states [K] of untrained policies."""
+    return jax.vmap(lambda row, key: make(*row).init(key))(rows, keys)
+
+
+def step_rows(make: Callable[..., Trainer], states: Any, rows: Row) -> tuple[Any, dict, Any]:
     """Run one iteration of every row."""
-    return jax.vmap(lambda state, one: one.step(state))(states, trainer)
+    return jax.vmap(lambda state, row: make(*row).step(state))(states, rows)
 
 
-def assess_rows(trainer: Trainer, keys: Array, states: Any) -> dict[str, dict[str, Array]]:
+def assess_rows(make: Callable[..., Trainer], rows: Row, keys: Array, states: Any) -> dict[str, dict[str, Array]]:
     """Evaluate every row."""
-    return jax.vmap(lambda one, key, state: one.assess(key, state))(trainer, keys, states)
+    return jax.vmap(lambda row, key, state: make(*row).assess(key, state))(rows, keys, states)
+
+
+def agents_of_rows(make: Callable[..., Trainer], rows: Row, states: Any) -> ppo.Agent:
+    """Return the agents [K] of all rows, ready to act."""
+    return jax.vmap(lambda row, state: make(*row).agent(state))(rows, states)
 
 
 def init_learning(env: Env, config: OptionsConfig, keys: Array) -> LearnState:

@@ -1,9 +1,12 @@
 """The main job, tiny but whole: what it leaves behind, what it refuses, and what an interruption changes (nothing)."""
 
 import dataclasses
+import gc
 import json
 import subprocess
 import sys
+import weakref
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -181,16 +184,27 @@ def test_an_interrupted_run_ends_as_if_it_had_not_been(finished, tmp_path, monke
     assert json.loads((folder / "summary.json").read_text())["ticks"] == 2 * (48 + 48)
 
 
-def test_a_run_repeated_is_the_same_to_the_last_bit(finished, tmp_path):
+def test_a_run_repeated_is_the_same_to_the_last_bit_and_lets_go_of_its_environments(finished, tmp_path, monkeypatch):
+    """A sweep of many runs in one process would otherwise hold the MuJoCo model of each."""
+    envs: list[weakref.ref] = []
+
+    def make(config):
+        made = make_envs(config)
+        envs.extend(map(weakref.ref, made))
+        return made
+
+    monkeypatch.setattr(pipeline, "make_envs", make)
     run_pipeline(CONFIG, tmp_path / "run")
     assert_same_runs(tmp_path / "run", finished)
+    gc.collect()
+    assert [env() for env in envs] == [None, None]
 
 
 @pytest.mark.parametrize("stage", ["collect", "flat"])
 def test_a_seed_starts_the_same_alone_among_others_and_in_a_sweep(stage):
     point = with_fields(CONFIG, train__ppo__learning_rate=0.01)
     env, _ = make_envs(CONFIG)
-    init = jax.jit(lambda rows, keys: init_rows(make_trainer(stage, rows, env), keys))
+    init = jax.jit(lambda rows, keys: init_rows(partial(make_trainer, stage, env), (rows, None), keys))
     keys = jax.vmap(jax.random.key)(jnp.arange(4))
     alone = init(as_rows([CONFIG], 1), keys[3:])
     for row, many in ((3, init(as_rows([CONFIG], 4), keys)), (7, init(as_rows([point, CONFIG], 4), jnp.tile(keys, 2)))):

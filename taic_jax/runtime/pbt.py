@@ -46,14 +46,14 @@ class Population:
         return Members(state, config, jax.vmap(lambda k: jax.random.fold_in(k, 1))(key), jnp.zeros(len(key), jnp.int32))
 
     def evolving(self, step: Callable[..., tuple[Any, dict, Any]]) -> Callable[..., tuple[Members, dict, Any]]:
-        """Return a step (members, trainer) from one (states, trainer) whose metrics hold `return`.
+        """Return a step (members, rows) from one (states, rows) whose metrics hold `return`.
 
-        The members' own configs replace the trainer's. Metrics hold the numbers of this step (`pbt/NAME`), and the row
-        whose weights each row goes on with (`pbt/parent`).
+        The members' own configs replace those of the rows. Metrics hold the numbers of this step (`pbt/NAME`), and the
+        row whose weights each row goes on with (`pbt/parent`).
         """
 
-        def call(members: Members, trainer: Any) -> tuple[Members, dict, Any]:
-            state, metrics, extra = step(members.state, trainer.replace(config=members.config))
+        def call(members: Members, rows: Any) -> tuple[Members, dict, Any]:
+            state, metrics, extra = step(members.state, (members.config, *rows[1:]))
             count = members.count + 1
             key, key_donor, key_factor = jax.vmap(partial(jax.random.split, num=3), out_axes=1)(members.key)
             score = jnp.where(metrics["nonfinite"] == FINITE, metrics["return"], jnp.nan)

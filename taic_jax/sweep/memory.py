@@ -1,5 +1,6 @@
 """The number of points of a sweep that fit into memory at once, measured on the programs for one row."""
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -53,8 +54,8 @@ def machine_memory() -> int:
 
 
 def _step_bytes(rows: Config, env: Any, stage: str, keys: jax.Array) -> int:
-    trainer = make_trainer(stage, rows, env)
-    return _program_bytes(step_rows, jax.eval_shape(init_rows, trainer, keys), trainer)
+    make, row = partial(make_trainer, stage, env), (rows, None)
+    return _program_bytes(partial(step_rows, make), jax.eval_shape(partial(init_rows, make), row, keys), row)
 
 
 def _experience(config: Config, env: Any) -> list[Experience]:

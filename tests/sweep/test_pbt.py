@@ -16,16 +16,15 @@ from taic_jax.nonfinite import FINITE
 from taic_jax.runtime.checkpoint import Checkpoints
 from taic_jax.runtime.pbt import Population, schedule
 from taic_jax.sweep.__main__ import main
-from taic_jax.trainer import Trainer
 from taic_jax.types import as_rows
 
 RATE = "train.ppo.learning_rate"
 BOUNDS = {RATE: (0.0, 1.0)}
 
 
-def learner(state, trainer):
+def learner(state, rows):
     """Add the learning rate to what was learnt; the return is all that was learnt, and 100 is too much."""
-    learnt, key = state["learnt"] + trainer.config.train.ppo.learning_rate, state["key"]
+    learnt, key = state["learnt"] + rows[0].train.ppo.learning_rate, state["key"]
     metrics = {"return": learnt, "nonfinite": jnp.where(learnt > 100, 0, FINITE)}
     return {"learnt": learnt, "key": key}, metrics, None
 
@@ -38,7 +37,7 @@ def evolved(rates: list[float], steps: int, every: int, bounds=BOUNDS):
     members = population.begin({"learnt": jnp.zeros(len(keys)), "key": keys}, config, keys)
     step, told = jax.jit(population.evolving(learner)), []
     for i in range(steps):
-        members, metrics, _ = step(members, Trainer(config, env=None, ticks=0))
+        members, metrics, _ = step(members, (config, None))
         told.append({"ticks": i + 1} | {f"train/{name}": np.asarray(x).tolist() for name, x in metrics.items()})
     return members, told
 
