@@ -136,7 +136,7 @@ def main() -> None:
         importlib.import_module(library)
     with tempfile.TemporaryDirectory() as folder, args.out.open("a") as out:
         tree = Path(folder) / "tree"
-        shutil.copytree(ROOT, tree, symlinks=True, ignore=shutil.ignore_patterns(".git", "__pycache__", "results"))
+        shutil.copytree(ROOT, tree, symlinks=True, ignore=shutil.ignore_patterns(".*", "__pycache__", "results"))
         print("\n| where | code | survivor |\n|---|---|---|", file=out)
         for name in args.files:
             for row in survivors(tree, name, args):

@@ -102,15 +102,17 @@ def test_a_folder_that_jax_was_told_is_kept():
     assert jax.config.values["jax_compilation_cache_dir"] == before
 
 
-def test_else_it_is_the_users_without_what_is_half_written(monkeypatch, tmp_path):
+def test_else_it_is_the_users_without_what_is_half_written_or_long_unused(monkeypatch, tmp_path):
     monkeypatch.setattr("platformdirs.user_cache_path", lambda name: tmp_path / name)
+    monkeypatch.setattr(compilation, "MAX_PROGRAMS", 1)
     told = {
         name: getattr(jax.config, name) for name in jax.config.values if name.startswith("jax_") and "cache" in name
     }
     folder = tmp_path / "taic_jax/programs"
     folder.mkdir(parents=True)
-    for name in ("half-cache", "whole-cache", "whole-atime"):
+    for i, name in enumerate(("half-cache", "old-cache", "old-atime", "whole-cache", "whole-atime")):
         (folder / name).touch()
+        os.utime(folder / name, (i, i))
     try:
         jax.config.update("jax_compilation_cache_dir", None)
         keep_programs()
