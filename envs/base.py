@@ -1,9 +1,10 @@
-"""The contract of every task: `Env`, a pair of pure unbatched functions on a `State` of arrays."""
+"""The contracts of a task, `Env`, and of the physics behind it, `Physics`: pure unbatched functions on arrays."""
 
 import abc
 from typing import Any
 
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 from flax import struct
 from jax import Array
@@ -18,6 +19,21 @@ class PhysicsState(struct.PyTreeNode):
     qpos: Array  # [nq] generalised positions
     qvel: Array  # [nv] generalised velocities
     qacc_warmstart: Array  # [nv] accelerations from which the constraint solver starts
+
+
+class Physics(abc.ABC):
+    """A model's dynamics on one backend; a tick has `substeps` engine steps."""
+
+    def __init__(self, model: mujoco.MjModel, substeps: int):
+        self.model, self.substeps = model, substeps
+
+    def init(self, qpos: Float[Array, " nq"], qvel: Float[Array, " nv"]) -> PhysicsState:
+        """Make the state from which an episode starts; needs no forward pass."""
+        return PhysicsState(qpos=qpos, qvel=qvel, qacc_warmstart=jnp.zeros_like(qvel))
+
+    @abc.abstractmethod
+    def step(self, state: PhysicsState, ctrl: Float[Array, " nu"]) -> PhysicsState:
+        """Advance by one tick, i.e. all its substeps, under constant controls."""
 
 
 class State(struct.PyTreeNode):

@@ -44,8 +44,8 @@ class BraxExport(base.Env):
     def step(self, state: Any, action: Array) -> base.State:
         """Step; the entries of Brax's wrappers in metrics and info stay."""
         metrics = {name: state.metrics[name] for name in self._metrics}
-        flags = {"terminated": state.done.astype(bool), "truncated": jnp.zeros((), bool)}
-        before = State(state.pipeline_state, state.obs, state.reward, **flags, metrics=metrics)
+        before = State.first(state.pipeline_state, state.obs, metrics)
+        before = before.replace(reward=state.reward, terminated=state.done.astype(bool))
         after = self.env.step(before, jnp.clip(action, -1.0, 1.0))
         return state.replace(**_fields(after), metrics={**state.metrics, **after.metrics})
 

@@ -78,8 +78,7 @@ class ForeignEnv(Env):
         physics = jax.tree.map(_strong, ForeignPhysics(getattr(state, self._simulation), state.info, parts))
         obs, reward = jnp.asarray(obs, jnp.float32), jnp.asarray(state.reward, jnp.float32)
         metrics = {name: jnp.asarray(value, jnp.float32) for name, value in state.metrics.items()}
-        flags = {"terminated": jnp.asarray(state.done, bool), "truncated": jnp.zeros((), bool)}
-        return State(physics, obs, reward, **flags, metrics=metrics)
+        return State.first(physics, obs, metrics).replace(reward=reward, terminated=jnp.asarray(state.done, bool))
 
 
 def _strong(leaf: Any) -> Array:

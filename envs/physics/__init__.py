@@ -3,8 +3,8 @@
 import jax
 from mujoco import MjModel
 
+from taic_jax.envs.base import Physics
 from taic_jax.envs.errors import UnknownNameError
-from taic_jax.envs.physics.base import Physics
 from taic_jax.envs.physics.mujoco import MujocoPhysics
 
 __all__ = ["BACKENDS", "MujocoPhysics", "Physics", "make_physics"]

@@ -7,9 +7,8 @@ import mujoco
 from jax import Array
 from jaxtyping import Float
 
-from taic_jax.envs.base import PhysicsState
+from taic_jax.envs.base import Physics, PhysicsState
 from taic_jax.envs.errors import BackendError, MissingExtraError
-from taic_jax.envs.physics.base import Physics
 from taic_jax.envs.third_party import third_party
 
 with third_party():

@@ -14,8 +14,7 @@ import psutil
 from jax import Array
 from jaxtyping import Float
 
-from taic_jax.envs.base import PhysicsState
-from taic_jax.envs.physics.base import Physics
+from taic_jax.envs.base import Physics, PhysicsState
 from taic_jax.envs.physics.host_call import HostCall, host_calls_work
 from taic_jax.envs.physics.watchdog import Watchdog
 

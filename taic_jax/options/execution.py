@@ -10,6 +10,7 @@ from taic_jax.config import OptionsConfig
 from taic_jax.networks import apply
 from taic_jax.options.model import OptionModel
 from taic_jax.options.termination import Termination, make_termination
+from taic_jax.types import Scalar
 
 
 @runtime_checkable
@@ -73,11 +74,12 @@ class Decoding(struct.PyTreeNode):
 
 
 class OptionExecutor(struct.PyTreeNode):
-    """D under a termination rule."""
+    """D under a termination rule; with `std`, actions are drawn from a normal distribution around D's output."""
 
     model: OptionModel
     termination: Termination = struct.field(pytree_node=False)
     length: int = struct.field(pytree_node=False)
+    std: Scalar = struct.field(default=None)
 
     @property
     def option_size(self) -> int:
@@ -86,27 +88,26 @@ class OptionExecutor(struct.PyTreeNode):
 
     @property
     def noise_size(self) -> int:
-        """X, the standard normal numbers that the termination rule takes each tick."""
-        return self.termination.noise_size
+        """X, the standard normal numbers of a tick: those of the termination rule, then any one per action."""
+        return self.termination.noise_size + (0 if self.std is None else self.model.networks.decoder.action_size)
 
     def start(self, option: Float[Array, " D"], obs: Float[Array, " S"]) -> Decoding:
         """Set D's carry from the code."""
         carry = self._decoder(option, method="start")
         return Decoding(option, carry, self.termination.start(self.model, self._state(obs)))
 
-    def act(
-        self, carry: Decoding, obs: Float[Array, " S"], noise: Array, disturbance: Array | float = 0.0
-    ) -> tuple[Decoding, Float[Array, " A"]]:
-        """Emit D's next action plus a disturbance, clipped to its bounds."""
+    def act(self, carry: Decoding, obs: Float[Array, " S"], noise: Float[Array, " X"]) -> tuple[Decoding, Array]:
+        """Emit D's next action, with any noise, clipped to its bounds."""
         state = self.model.state_scale(self._state(obs))
         memory, (action, end_logit) = self._decoder(carry.carry, carry.option, state, method="step")
+        disturbance = 0.0 if self.std is None else self.std * noise[self.termination.noise_size :]
         action = jnp.clip(action + disturbance, -1.0, 1.0)
         followed = self.termination.follow(self.model, carry.memory, action, end_logit)
         return Decoding(carry.option, memory, followed), action
 
     def ended(self, carry: Decoding, obs: Float[Array, " S"], noise: Float[Array, " X"]) -> Bool[Array, ""]:
         """Ask the termination rule."""
-        return self.termination.ended(self.model, carry.memory, self._state(obs), noise)
+        return self.termination.ended(self.model, carry.memory, self._state(obs), noise[: self.termination.noise_size])
 
     def _state(self, obs: Float[Array, " S"]) -> Float[Array, " P"]:
         """Return the proprioceptive slice: an observation may have more entries than the model reads."""

@@ -5,7 +5,7 @@ The executor asks its rule after every tick. `memory` is the state that a rule c
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -37,53 +37,35 @@ def prefix_errors(
     return jax.vmap(prediction_loss)(predicted, model.change_scale(states[1:] - states[:1]))
 
 
-@runtime_checkable
-class Termination(Protocol):
-    """A rule that ends an option, unbatched, with standard normal `noise` [X]."""
-
-    @property
-    def noise_size(self) -> int:
-        """X."""
-        ...
-
-    def start(self, model: OptionModel, state: Float[Array, " P"]) -> Any:
-        """Return the memory of an option that begins in this state."""
-        ...
-
-    def follow(self, model: OptionModel, memory: Any, action: Float[Array, " A"], end_logit: Array) -> Any:
-        """Return the memory after D emitted an action and an end logit."""
-        ...
-
-    def ended(self, model: OptionModel, memory: Any, state: Float[Array, " P"], noise: Array) -> Bool[Array, ""]:
-        """Return whether the option ends in the state after the tick."""
-        ...
-
-
 @dataclass(frozen=True)
-class Fixed:
-    """Fix-len (§3.4.1): every option takes all its ticks."""
+class Termination:
+    """A rule that ends an option, unbatched; this one remembers nothing and never ends an option early.
+
+    `noise_size` is X, the standard normal numbers that `ended` takes.
+    """
 
     noise_size: int = 0
 
-    def start(self, model: OptionModel, state: Float[Array, " P"]) -> None:
-        """Remember nothing."""
+    def start(self, model: OptionModel, state: Float[Array, " P"]) -> Any:
+        """Return the memory of an option that begins in this state."""
 
-    def follow(self, model: OptionModel, memory: None, action: Float[Array, " A"], end_logit: Array) -> None:
-        """Remember nothing."""
+    def follow(self, model: OptionModel, memory: Any, action: Float[Array, " A"], end_logit: Array) -> Any:
+        """Return the memory after D emitted an action and an end logit."""
 
-    def ended(self, model: OptionModel, memory: None, state: Float[Array, " P"], noise: Array) -> Bool[Array, ""]:
-        """Never end early."""
+    def ended(self, model: OptionModel, memory: Any, state: Float[Array, " P"], noise: Array) -> Bool[Array, ""]:
+        """Return whether the option ends in the state after the tick."""
         return jnp.zeros((), bool)
 
 
-@dataclass(frozen=True)
-class Output:
+class Fixed(Termination):
+    """Fix-len (§3.4.1): every option takes all its ticks."""
+
+
+class Output(Termination):
     """Term-output (§3.4.2): D's end signal ends the option; the memory is the latest logit.
 
     With `noise_size` 1 the signal is a probability, and the noise draws from it; with 0 it is yes above one half.
     """
-
-    noise_size: int
 
     def start(self, model: OptionModel, state: Float[Array, " P"]) -> Float[Array, ""]:
         """Remember no signal yet."""
@@ -110,11 +92,8 @@ class Following(struct.PyTreeNode):
     option: Array
 
 
-@dataclass(frozen=True)
-class Predict:
+class Predict(Termination):
     """Term-predict (§3.4.3): E follows the executed actions, and a surprised P ends the option."""
-
-    noise_size: int = 0
 
     def start(self, model: OptionModel, state: Float[Array, " P"]) -> Following:
         """Remember the option's first state."""

@@ -18,7 +18,7 @@ from taic_jax.config import FineTuneConfig, PPOConfig
 from taic_jax.envs.base import Env
 from taic_jax.networks import apply
 from taic_jax.nonfinite import earliest, first_nonfinite
-from taic_jax.options.execution import Decoding, OptionExecutor
+from taic_jax.options.execution import OptionExecutor
 from taic_jax.options.model import OptionModel
 from taic_jax.rl import ppo
 from taic_jax.rl.returns import Judgement, semi_markov_advantages
@@ -32,40 +32,6 @@ class Tuned(struct.PyTreeNode):
 
     decoder: Any
     optimizer: optax.OptState
-
-
-class NoisyExecutor(struct.PyTreeNode):
-    """An option executor whose actions are drawn from a normal distribution around D's output."""
-
-    inner: OptionExecutor
-    std: Scalar
-
-    @property
-    def option_size(self) -> int:
-        """D."""
-        return self.inner.option_size
-
-    @property
-    def length(self) -> int:
-        """L, the most ticks of an option."""
-        return self.inner.length
-
-    @property
-    def noise_size(self) -> int:
-        """X, the standard normal numbers of a tick: those of the inner executor, then one per action."""
-        return self.inner.noise_size + self.inner.model.networks.decoder.action_size
-
-    def start(self, option: Float[Array, " D"], obs: Float[Array, " S"]) -> Decoding:
-        """Start the inner executor."""
-        return self.inner.start(option, obs)
-
-    def act(self, carry: Decoding, obs: Float[Array, " S"], noise: Float[Array, " X"]) -> tuple[Decoding, Array]:
-        """Emit D's next action with noise, clipped to its bounds."""
-        return self.inner.act(carry, obs, noise[: self.inner.noise_size], self.std * noise[self.inner.noise_size :])
-
-    def ended(self, carry: Decoding, obs: Float[Array, " S"], noise: Float[Array, " X"]) -> Bool[Array, ""]:
-        """Ask the inner executor."""
-        return self.inner.ended(carry, obs, noise[: self.inner.noise_size])
 
 
 class Actions(struct.PyTreeNode):
@@ -143,7 +109,7 @@ def iterate(
     `config` is of PPO; its `clip`, `gamma`, `lambda_` and `max_grad_norm` apply to D too. `fine` has its other
     settings, `executor` the learnt options. Returns the next state, D, and the metrics of both.
     """
-    noisy = NoisyExecutor(tuned_executor(executor, tuned.decoder), fine.std)
+    noisy = tuned_executor(executor, tuned.decoder).replace(std=fine.std)
     after, metrics, ticks, judgement = ppo.iterate(config, env, noisy, num_iterations, state)
     rows = _rows(config, noisy, state.running.option.option, ticks, judgement)
     learning_rate = ppo.step_size(config, fine.learning_rate, state.iteration, num_iterations)
@@ -159,18 +125,17 @@ def iterate(
 
 
 def _rows(
-    config: PPOConfig, noisy: NoisyExecutor, running: Float[Array, "B D"], ticks: Rollout, judgement: Judgement
+    config: PPOConfig, noisy: OptionExecutor, running: Float[Array, "B D"], ticks: Rollout, judgement: Judgement
 ) -> Actions:
     """Return every tick as a row, with the advantage of its action; `running` are the options at the first tick."""
     advantage = semi_markov_advantages(judgement, jnp.ones_like(ticks.ended), config.gamma, config.lambda_)
-    model, tick = noisy.inner.model, ticks.duration - 1
+    model, tick = noisy.model, ticks.duration - 1
     option = fill_options(ticks.option, ticks.decision, running)
     proprioception = model.state_scale(ticks.obs[..., : model.state_size])
     means = jax.vmap(jax.vmap(partial(mean_action, model, noisy.length)))(option, proprioception, tick)
     action = means + noisy.std * ticks.noise[..., -means.shape[-1] :]
     log_prob = jax.vmap(partial(_log_prob, std=noisy.std))(action, means)
-    advantage = (advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-8)
-    rows = Actions(option, proprioception, tick, action, log_prob, advantage)
+    rows = Actions(option, proprioception, tick, action, log_prob, ppo.standardize(advantage))
     return jax.tree.map(lambda x: x.reshape((-1, *x.shape[2:])), rows)
 
 

@@ -93,8 +93,8 @@ def step_size(config: PPOConfig, learning_rate: Scalar, iteration: Int[Array, ""
     return learning_rate * (1.0 - progress)
 
 
-def _standardize(x: Float[Array, " R"], mask: Array) -> Float[Array, " R"]:
-    """Subtract the mean and divide by the standard deviation of the masked entries."""
+def standardize(x: Float[Array, "..."], mask: Array | None = None) -> Float[Array, "..."]:
+    """Subtract the mean and divide by the standard deviation, those of the masked entries."""
     mean = jnp.mean(x, where=mask)
     return (x - mean) / (jnp.std(x, where=mask) + 1e-8)
 
@@ -171,7 +171,7 @@ def improve(
 ) -> Update:
     """Run all epochs of updates on the ticks that are decisions."""
     if config.normalize_advantage:
-        rows = rows.replace(advantage=_standardize(rows.advantage, decision))
+        rows = rows.replace(advantage=standardize(rows.advantage, decision))
     learning_rate = step_size(config, config.learning_rate, state.iteration, num_iterations)
     policy = make_policy(executor, config)
     return update(policy, config, learning_rate, state.params, state.optimizer, rows, decision, key)

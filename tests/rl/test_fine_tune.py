@@ -66,7 +66,7 @@ def tune(fine, executor: OptionExecutor, count: int):
 def test_changes_d_and_nothing_else(decoder):
     executor = make(decoder)
     (state, tuned), (state_after, tuned_after), _ = tune(FINE, executor, 1)
-    noisy = fine_tune.NoisyExecutor(executor, FINE.std)
+    noisy = executor.replace(std=FINE.std)
     alone, *_ = jax.jit(lambda state: ppo.iterate(PPO, Forward(), noisy, ITERATIONS, state))(state)
     for name in ("params", "optimizer", "obs_statistics", "reward_scale", "iteration"):
         jax.tree.map(
@@ -88,7 +88,7 @@ def test_likelihoods_are_of_the_actions_that_were_taken(decoder):
     executor = make(decoder)
     # After an iteration, whose last options go on in the next.
     state = tune(dataclasses.replace(FINE, learning_rate=jnp.zeros(())), executor, 1)[1][0]
-    noisy = fine_tune.NoisyExecutor(executor, FINE.std)
+    noisy = executor.replace(std=FINE.std)
     _, _, ticks, judgement = jax.jit(lambda state: ppo.iterate(PPO, Forward(), noisy, ITERATIONS, state))(state)
     rows = fine_tune._rows(PPO, noisy, state.running.option.option, ticks, judgement)
     np.testing.assert_allclose(np.clip(rows.action, -1, 1), ticks.action.reshape(-1, 1), atol=1e-5)

@@ -103,7 +103,7 @@ def test_a_step_of_d_is_the_plain_update(decoder, truncated, normalize, decay):
     config = as_arrays(dataclasses.replace(PPO, normalize_reward=normalize, learning_rate_decay=decay))
     env, executor, fine = Walk(truncated), make(decoder), as_arrays(FINE)
     state = ppo.init(config, env, executor, jax.random.key(0)).replace(iteration=jnp.int32(ITERATION))
-    noisy = fine_tune.NoisyExecutor(executor, fine.std)
+    noisy = executor.replace(std=fine.std)
     running, ticks = jax.jit(partial(ppo.collect, config, env, noisy))(state, jax.random.split(state.key, 3)[1])
     tune = jax.jit(partial(fine_tune.iterate, config, fine, env, executor, ITERATIONS))
     _, tuned, metrics = tune(state, fine_tune.init(config, executor))
