@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Key
 from taic_jax.envs.arenas import ANT_QPOS, ANT_QVEL, Arena, furnish
 from taic_jax.envs.base import PhysicsState, State
 from taic_jax.envs.errors import UnknownNameError
-from taic_jax.envs.locomotion import Judgement, Locomotion
+from taic_jax.envs.locomotion import Locomotion, Outcome
 from taic_jax.envs.rendering import render_mujoco
 from taic_jax.envs.robots import ROBOTS, compile_spec, initial_qpos, load_spec, with_body
 
@@ -36,7 +36,7 @@ class AntTurn(Locomotion):
         angle = wrapped(heading(after.qpos[3:7]) - heading(before.qpos[3:7]))
         return after.replace(turns=before.turns + angle / (2 * jnp.pi))
 
-    def _progress(self, before: TurningState, after: TurningState) -> Judgement:
+    def _progress(self, before: TurningState, after: TurningState) -> Outcome:
         rate = 2 * jnp.pi * (after.turns - before.turns) / self.dt
         return rate, {"yaw_rate": rate, "turns": after.turns}
 
@@ -151,7 +151,7 @@ class AntArena(Locomotion):
     def _is_healthy(self, physics: PhysicsState) -> Bool[Array, ""]:
         return jnp.ones((), bool)
 
-    def _judge(self, before: ArenaState, after: ArenaState, action: Float[Array, " A"]) -> Judgement:
+    def _judge(self, before: ArenaState, after: ArenaState, action: Float[Array, " A"]) -> Outcome:
         distance = self._distance(after)
         flags = {"success": distance < SUCCESS_RADIUS, "upside_down": upside_down(after.qpos[3:7])}
         metrics = {name: flag.astype(jnp.float32) for name, flag in flags.items()}

@@ -15,7 +15,7 @@ from taic_jax.envs.rendering import render_mujoco
 from taic_jax.envs.robots import Robot, compile_spec, initial_qpos, load_spec
 from taic_jax.envs.views import Views, make_views
 
-Judgement = tuple[Float[Array, ""], dict[str, Array]]  # A reward, or a term of it, and metrics.
+Outcome = tuple[Float[Array, ""], dict[str, Array]]  # A reward, or a term of it, and metrics.
 
 
 class Locomotion(Env):
@@ -105,7 +105,7 @@ class Locomotion(Env):
             healthy &= jnp.all(jnp.abs(rest) < robot.healthy_state)
         return healthy
 
-    def _judge(self, before: PhysicsState, after: PhysicsState, action: Float[Array, " A"]) -> Judgement:
+    def _judge(self, before: PhysicsState, after: PhysicsState, action: Float[Array, " A"]) -> Outcome:
         """Return the tick's reward and metrics."""
         robot = self.robot
         healthy_reward = jnp.float32(robot.healthy_reward)
@@ -116,6 +116,6 @@ class Locomotion(Env):
         metrics |= {"healthy_reward": healthy_reward, "control_cost": control_cost}
         return progress + healthy_reward - control_cost, metrics
 
-    def _progress(self, before: PhysicsState, after: PhysicsState) -> Judgement:
+    def _progress(self, before: PhysicsState, after: PhysicsState) -> Outcome:
         velocity = (after.qpos[0] - before.qpos[0]) / self.dt
         return velocity, {"forward_reward": velocity, "x_velocity": velocity}

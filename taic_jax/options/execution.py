@@ -99,11 +99,11 @@ class OptionExecutor(struct.PyTreeNode):
     def act(self, carry: Decoding, obs: Float[Array, " S"], noise: Float[Array, " X"]) -> tuple[Decoding, Array]:
         """Emit D's next action, with any noise, clipped to its bounds."""
         state = self.model.state_scale(self._state(obs))
-        memory, (action, end_logit) = self._decoder(carry.carry, carry.option, state, method="step")
+        next_carry, (action, end_logit) = self._decoder(carry.carry, carry.option, state, method="step")
         disturbance = 0.0 if self.std is None else self.std * noise[self.termination.noise_size :]
         action = jnp.clip(action + disturbance, -1.0, 1.0)
         followed = self.termination.follow(self.model, carry.memory, action, end_logit)
-        return Decoding(carry.option, memory, followed), action
+        return Decoding(carry.option, next_carry, followed), action
 
     def ended(self, carry: Decoding, obs: Float[Array, " S"], noise: Float[Array, " X"]) -> Bool[Array, ""]:
         """Ask the termination rule."""

@@ -35,11 +35,14 @@ class Tuned(struct.PyTreeNode):
 
 
 class Actions(struct.PyTreeNode):
-    """R ticks, the input of D's loss: D's inputs, the action before clipping, its likelihood and its advantage."""
+    """R ticks, the input of D's loss: D's inputs, the action before clipping, its likelihood and its advantage.
+
+    `tick` counts from 0 at the option's start.
+    """
 
     option: Array
     state: Array
-    duration: Array
+    tick: Array
     action: Array
     log_prob: Array
     advantage: Array
@@ -80,7 +83,7 @@ def decoder_loss(
     """Return PPO's clipped loss of M actions plus the weighted KL to the executor's D, and both terms."""
     tuned, learnt = executor.model.with_decoder(decoder), executor.model
     means, anchors = (
-        jax.vmap(partial(mean_action, model, executor.length))(batch.option, batch.state, batch.duration)
+        jax.vmap(partial(mean_action, model, executor.length))(batch.option, batch.state, batch.tick)
         for model in (tuned, learnt)
     )
     ratio = jnp.exp(_log_prob(batch.action, means, fine.std) - batch.log_prob)

@@ -92,7 +92,7 @@ def test_likelihoods_are_of_the_actions_that_were_taken(decoder):
     _, _, ticks, judgement = jax.jit(lambda state: ppo.iterate(PPO, Forward(), noisy, ITERATIONS, state))(state)
     rows = fine_tune._rows(PPO, noisy, state.running.option.option, ticks, judgement)
     np.testing.assert_allclose(np.clip(rows.action, -1, 1), ticks.action.reshape(-1, 1), atol=1e-5)
-    assert rows.duration.min() == 0 and rows.duration.max() == L - 1
+    assert rows.tick.min() == 0 and rows.tick.max() == L - 1
     # One standard deviation away the likelihood is exp(-1/2) of the highest.
     np.testing.assert_allclose(np.mean(rows.log_prob), -0.5, atol=0.2)
 
