@@ -22,6 +22,7 @@ from taic_jax.rl.ppo import Agent, num_iterations
 from taic_jax.runtime.driver import Run, Stopped
 from taic_jax.runtime.files import atomic_file, json_safe, writes_here
 from taic_jax.runtime.run_folder import Method, Summary
+from taic_jax.trainer import Trained
 
 PACKAGES = ("taic_jax", "jax", "jaxlib", "flax", "optax", "brax", "mujoco", "mujoco-mjx", "orbax-checkpoint")
 MIB = 2**20
@@ -56,18 +57,15 @@ def plan(config: Config, env: Env, source: Env) -> str:
     return "\n".join(lines)
 
 
-def as_summary(run: Run, methods: Mapping[str, Mapping[str, Any]]) -> Summary:
-    """Return the contents of `summary.json`, from a run after its last stage.
-
-    `methods` are, by name, the evaluations `first` and `last` of `trainer.Trained`.
-    """
+def as_summary(run: Run, methods: Mapping[str, Trained]) -> Summary:
+    """Return the contents of `summary.json`, from a run after its last stage, and from its policies by method."""
     clock = run.clock
     return {
         "ticks": clock.ticks,
         "ticks_per_second": clock.ticks / clock.run if clock.run else None,
         "seconds": {"compile": clock.compile, "run": clock.run},
         "stopped": {stage: _stopped(seeds) for stage, seeds in run.stopped.items() if (seeds.code != FINITE).any()},
-        "methods": {name: _method(**evaluations) for name, evaluations in methods.items()},
+        "methods": {name: _method(x.first, x.last) for name, x in methods.items()},
         "versions": {name: _version(name) for name in PACKAGES},
         "commit": commit(),
     }

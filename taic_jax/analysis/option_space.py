@@ -41,7 +41,7 @@ def execute(
     env, num_options = AutoReset(env), len(option)
     begin = start(env, executor, num_options, key_start)
     if many:
-        begin, _ = rollout(env, executor, _from_prior, begin, key_warm_up, WARM_UP)
+        begin, _ = rollout(env, executor, lambda _, noise: always(noise, _, noise), begin, key_warm_up, WARM_UP)
         begin = begin.replace(ended=jnp.ones_like(begin.ended))
     else:
         first = jax.tree.map(lambda x: jnp.broadcast_to(x[:1], x.shape), begin.env.replace(key=None))
@@ -50,10 +50,6 @@ def execute(
     last, size = jnp.argmax(ticks.ended, axis=0), env.proprioceptive_size
     end = jnp.take_along_axis(ticks.final_obs, last[None, :, None], axis=0)[0]
     return Effects(option, ticks.obs[0, :, :size], end[:, :size], last + 1)
-
-
-def _from_prior(obs: Float[Array, "B S"], noise: Float[Array, "B D"]) -> tuple[Array, Array]:
-    return noise, jnp.zeros(len(noise))
 
 
 def always(option: Float[Array, "B D"], obs: Float[Array, "B S"], noise: Array) -> tuple[Array, Array]:

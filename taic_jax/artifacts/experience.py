@@ -24,7 +24,7 @@ from taic_jax.options.execution import IdentityExecutor
 from taic_jax.rl import ppo
 from taic_jax.rl.rollout import Rollout
 from taic_jax.runtime.checkpoint import ArtifactError
-from taic_jax.runtime.files import DESCRIPTION, atomic_file, save_description, writing
+from taic_jax.runtime.files import DESCRIPTION, atomic_file, save_json, writing
 from taic_jax.types import as_arrays
 
 EXPERIENCE = "experience"
@@ -77,7 +77,7 @@ class ExperienceStore:
         self.folder, self.capacity = folder, capacity
         with writing(folder):
             folder.mkdir(parents=True, exist_ok=True)
-        save_description(folder, description)
+        save_json(folder / DESCRIPTION, description)
 
     def write(self, iteration: int, block: Experience) -> None:
         """Save the block of one iteration atomically, or raise SaveError, and drop the oldest beyond the capacity."""

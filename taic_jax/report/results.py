@@ -16,7 +16,9 @@ def methods_of(run: LoadedRun) -> list[dict[str, Any]]:
     results = {_stage_of(run, name): _from_summary(method) for name, method in run.methods.items()}
     for stage in run.trained_stages():
         if stage not in results:
-            results[stage] = _from_evaluation(run, stage)
+            returns = {mode: f"evaluate/{stage}/{mode}" for mode in MODES}
+            values = ((mode, per_seed(row, name)) for row in run.of_stage("evaluate") for mode, name in returns.items())
+            results[stage] = {mode: summarize(x) for mode, x in values if x is not None}
     rows = []
     for stage, statistics in results.items():
         ticks, uncounted = pretraining(run, stage)
@@ -37,12 +39,6 @@ def _from_summary(method: dict[str, Any]) -> dict[str, Any]:
     if "first_per_seed" in method["return"]:
         result["return_untrained"] = summarize(method["return"]["first_per_seed"])
     return result
-
-
-def _from_evaluation(run: LoadedRun, stage: str) -> dict[str, Any]:
-    """Return the results of a stage without a summary, from the rows of stage evaluate."""
-    values = ((mode, per_seed(row, f"evaluate/{stage}/{mode}")) for row in run.of_stage("evaluate") for mode in MODES)
-    return {mode: summarize(x) for mode, x in values if x is not None}
 
 
 def histograms_of(run: LoadedRun) -> list[dict[str, Any]]:

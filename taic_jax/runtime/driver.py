@@ -19,7 +19,7 @@ from taic_jax.config import Config
 from taic_jax.nonfinite import FINITE, QUANTITIES, Guarded, begin, guarded
 from taic_jax.runtime.checkpoint import ArtifactError, Checkpoints, save_tree
 from taic_jax.runtime.devices import Devices
-from taic_jax.runtime.files import save_description, save_json, writes_here
+from taic_jax.runtime.files import DESCRIPTION, save_json, writes_here
 from taic_jax.runtime.hosts import agree
 from taic_jax.runtime.logging import RunLogger
 from taic_jax.runtime.pbt import Members, Population
@@ -162,7 +162,7 @@ class Run:
         state, config = (guard.state.state, guard.state.config) if evolved else (guard.state, self.config)
         for name, rows in {"state": state, "config": config}.items():
             save_tree(folder / name, jax.tree.map(lambda x: x[seed], rows))
-        save_description(folder, description | {"quantity": quantity})
+        save_json(folder / DESCRIPTION, description | {"quantity": quantity})
         why = f"its {quantity} is not finite; --replay {folder} shows it again"
         print(f"taic_jax: seed {seed} stopped in {stage} after {step * unit:,}: {why}", file=sys.stderr)
 

@@ -13,7 +13,7 @@ import filelock
 
 from taic_jax.config import COLLECT, Config, walk
 from taic_jax.config_io import load_config, to_yaml
-from taic_jax.runtime.files import PARTIAL, SaveError, remove_partial, save_json, save_text, writes_here, writing
+from taic_jax.runtime.files import PARTIAL, SaveError, remove_partial, save_text, writes_here, writing
 from taic_jax.runtime.hosts import agree
 
 LOCK = ".lock"  # file of a run's folder that the process writing there locks
@@ -122,10 +122,6 @@ class RunFolder:
         lines = self.metrics_path.read_text().splitlines(keepends=True)
         rows = [json.loads(line) for line in lines if line.endswith("\n")]
         return [row for row in rows if stage in (None, row["stage"])]
-
-    def save_summary(self, summary: Summary) -> None:
-        """Write the results, which finishes the run."""
-        save_json(self.summary_path, summary)
 
     @property
     def _is_used(self) -> bool:
