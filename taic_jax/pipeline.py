@@ -226,10 +226,8 @@ def learn(run: Run, env: Env) -> OptionModel:
     config, dataset = run.config.options, select_windows(run, env)
     state = jax.jit(partial(trainer.init_learning, env))(config, run.stage_keys("learn"))
     if config.steps:  # without steps D stays random
-        unit = trainer.steps_per_log(config)
-        state = drive(
-            run, "learn", trainer.learn_rows, state, config, dataset, num_steps=config.steps // unit, unit=unit
-        )
+        step, unit = trainer.learn_rows, trainer.steps_per_log(config)
+        state = drive(run, "learn", step, state, config, dataset, num_steps=config.steps // unit, unit=unit)
     model = learning.as_model(state, dataset)
     save_options(run.dir / OPTIONS, model, env, config)
     return model

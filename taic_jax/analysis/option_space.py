@@ -41,7 +41,7 @@ def execute(
     env, num_options = AutoReset(env), len(option)
     begin = start(env, executor, num_options, key_start)
     if many:
-        begin, _ = rollout(env, executor, lambda _, noise: always(noise, _, noise), begin, key_warm_up, WARM_UP)
+        begin, _ = rollout(env, executor, lambda obs, noise: always(noise, obs, noise), begin, key_warm_up, WARM_UP)
         begin = begin.replace(ended=jnp.ones_like(begin.ended))
     else:
         first = jax.tree.map(lambda x: jnp.broadcast_to(x[:1], x.shape), begin.env.replace(key=None))
