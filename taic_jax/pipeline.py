@@ -215,9 +215,9 @@ def collect(run: Run, env: Env) -> Trained:
     config = run.config.collect
     if experience_ticks(config) < config.ticks:
         run.logger.say(f"collect: of {config.ticks:,} ticks the newest {experience_ticks(config):,} are kept")
-    store = ExperienceStore(run.dir / EXPERIENCE, num_blocks(config), describe(env) | {"seeds": len(run.keys)})
+    store = ExperienceStore(run.folder.path / EXPERIENCE, num_blocks(config), describe(env) | {"seeds": len(run.keys)})
     trained = _train(run, env, "collect", after=store.write)
-    save_policy(run.dir / POLICY, trained.agent, env)
+    save_policy(run.folder.path / POLICY, trained.agent, env)
     return trained
 
 
@@ -229,7 +229,7 @@ def learn(run: Run, env: Env) -> OptionModel:
         step, unit = trainer.learn_rows, trainer.steps_per_log(config)
         state = drive(run, "learn", step, state, config, dataset, num_steps=config.steps // unit, unit=unit)
     model = learning.as_model(state, dataset)
-    save_options(run.dir / OPTIONS, model, env, config)
+    save_options(run.folder.path / OPTIONS, model, env, config)
     return model
 
 
@@ -243,7 +243,7 @@ def select_windows(run: Run, env: Env) -> Dataset:
     config, rows, seeds = run.config.options, len(run.keys), run.config.seeds
     names = config.experience or (COLLECT,)
     sources = [
-        gather_experience(run.dir, env, rows)
+        gather_experience(run.folder.path, env, rows)
         if name == COLLECT
         else _for_points(gather_experience(Path(name), env, seeds), rows // seeds)
         for name in names
@@ -270,7 +270,7 @@ def train_over_options(run: Run, env: Env, model: OptionModel) -> Trained:
     trained = _train(run, env, "train", model)
     if config.train.fine_tune.epochs:
         executor: Any = trained.agent.executor
-        save_options(run.dir / "options_fine_tuned", executor.model, env, config.options)
+        save_options(run.folder.path / "options_fine_tuned", executor.model, env, config.options)
     return trained
 
 

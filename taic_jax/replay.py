@@ -58,7 +58,7 @@ def _stage(run: Run, env: Env, source: Env, stage: str) -> tuple[Any, Any, tuple
     if stage == "learn":
         states = jax.eval_shape(partial(init_learning, source), config.options, keys)
         return learn_rows, states, (config.options, select_windows(run, source))
-    folder = Path(config.options.source or run.dir)
+    folder = Path(config.options.source or run.folder.path)
     model = load_options(folder, env, config.options, len(keys)) if stage == "train" else None
     make = partial(make_trainer, stage, source if stage == COLLECT else env)
     states = jax.eval_shape(partial(init_rows, make), (config, model), keys)
