@@ -13,16 +13,7 @@ import jax.numpy as jnp
 from taic_jax import trainer
 from taic_jax.artifacts.experience import EXPERIENCE, ExperienceStore, gather_experience, num_blocks
 from taic_jax.artifacts.models import OPTIONS, POLICY, describe, load_options, load_policy, save_options, save_policy
-from taic_jax.config import (
-    COLLECT,
-    Config,
-    ConfigError,
-    Shard,
-    collector_is_baseline,
-    experience_ticks,
-    impossible,
-    needs_collect,
-)
+from taic_jax.config import COLLECT, Config, ConfigError, Shard, collector_is_baseline, impossible, needs_collect
 from taic_jax.envs import environment_options, make_env
 from taic_jax.envs.base import Env
 from taic_jax.envs.errors import RenderingError, UnknownNameError
@@ -213,8 +204,8 @@ def _compile_rows(run: Run, stage: str, function: Callable[..., Any], *args: Any
 def collect(run: Run, env: Env) -> Trained:
     """Train flat PPO, save its ticks as experience, and the policy as the artifact `policy`."""
     config = run.config.collect
-    if experience_ticks(config) < config.ticks:
-        run.logger.say(f"collect: of {config.ticks:,} ticks the newest {experience_ticks(config):,} are kept")
+    if 0 < config.capacity < config.ticks:
+        run.logger.say(f"collect: of {config.ticks:,} ticks the newest {config.capacity:,} are kept")
     store = ExperienceStore(run.folder.path / EXPERIENCE, num_blocks(config), describe(env) | {"seeds": len(run.keys)})
     trained = _train(run, env, "collect", after=store.write)
     save_policy(run.folder.path / POLICY, trained.agent, env)

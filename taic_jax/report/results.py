@@ -47,20 +47,13 @@ def histograms_of(run: LoadedRun) -> list[dict[str, Any]]:
     result = [(stage, share, "evaluation after training") for stage, share in shares.items() if len(share) > 1]
     if not result:
         for stage in run.trained_stages():
-            counts = _last_counts(run, stage)
+            rows = (row.get(f"{stage}/durations") for row in reversed(run.of_stage(stage)))
+            last = next((x for x in rows if x and isinstance(x[0], list)), [[]])
+            counts = np.nansum(np.array(last, float), axis=0)  # over all seeds
             of = f"the iteration that ends at {run.ticks(stage):,} ticks of training"
             if len(counts) > 1 and counts.sum():
                 result.append((stage, (counts / counts.sum()).tolist(), of))
     return [{"label": label_of(run, stage), "share": share, "of": of} for stage, share, of in result]
-
-
-def _last_counts(run: LoadedRun, stage: str) -> np.ndarray:
-    """Return the number of options of 1..L ticks in the newest iteration that counted them, over all seeds."""
-    for row in reversed(run.of_stage(stage)):
-        counts = row.get(f"{stage}/durations")
-        if counts and isinstance(counts[0], list):
-            return np.nansum(np.array(counts, float), axis=0)
-    return np.empty(0)
 
 
 def facts_of(run: LoadedRun) -> dict[str, Any]:
