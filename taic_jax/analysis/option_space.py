@@ -77,6 +77,7 @@ class WindowCodes(struct.PyTreeNode):
     end: Array
 
 
+@partial(jax.jit, static_argnames="count")
 def encode_windows(
     config: OptionsConfig,
     model: OptionModel,
@@ -104,8 +105,7 @@ def measure(
     """
     config = as_arrays(config)
     key_prior, key_windows, key_data, *keys = jax.random.split(key, 7)
-    encode = jax.jit(encode_windows, static_argnums=4)
-    windows = jax.device_get(encode(config, model, experience, key_windows, count))
+    windows = jax.device_get(encode_windows(config, model, experience, key_windows, count))
     data = windows.mean + jnp.exp(windows.log_std) * jax.random.normal(key_data, windows.mean.shape)
     prior = jax.random.normal(key_prior, data.shape)
     executor = make_executor(config, model)

@@ -72,8 +72,7 @@ def _window_codes(
     config: OptionsConfig, model: OptionModel, experience: list[Experience], count: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the codes [N, D] of windows and the changes [N, P] in them."""
-    encode = jax.jit(encode_windows, static_argnums=4)
-    windows = jax.device_get(encode(as_arrays(config), model, experience, jax.random.key(0), count))
+    windows = jax.device_get(encode_windows(as_arrays(config), model, experience, jax.random.key(0), count))
     return windows.mean, windows.end - windows.start
 
 

@@ -224,7 +224,7 @@ def drive(
     guard, args = run.devices.place((guard, args))
     compiled = run.compile(stage, guarded(step), guard, *args, donate=True)
     saved = time.perf_counter()
-    with checkpoints.waited_for(), run.logger.stage(stage, num_steps * unit, done=first * unit):
+    with checkpoints.waited_for(), run.logger.doing(stage, num_steps * unit, done=first * unit):
         for index in range(first, num_steps):
             guard, metrics, extra = compiled(guard, *args)
             metrics, new_codes = jax.device_get(run.rows((metrics, guard.code)))
