@@ -13,7 +13,6 @@ from taic_jax.analysis.option_space import encode_windows
 from taic_jax.artifacts.experience import gather_experience
 from taic_jax.artifacts.models import OPTIONS, load_options, read_body
 from taic_jax.config import COLLECT, ConfigError, OptionsConfig
-from taic_jax.options.dataset import Experience
 from taic_jax.options.model import OptionModel
 from taic_jax.report.runs import LoadedRun, run_of
 from taic_jax.runtime.checkpoint import ArtifactError
@@ -48,10 +47,11 @@ def option_plot(run: LoadedRun, count: int) -> dict[str, Any]:
     try:
         sources = [home if name == COLLECT else Path(name) for name in config.experience or (COLLECT,)]
         columns = [jax.tree.map(lambda x: x[0], gather_experience(source, body, 1)) for source in sources]
-        (option, change), drawn, why = _window_codes(config, model, columns, count), "windows", ""
+        windows = jax.device_get(encode_windows(as_arrays(config), model, columns, jax.random.key(0), count))
+        option, change, drawn, why = windows.mean, windows.end - windows.start, "windows", ""
     except (ArtifactError, OSError) as error:
-        (option, change), drawn = _prior_codes(config, model, count), "prior"
-        why = f"what they were learnt from is not there: {error}"
+        option, change = _prior_codes(config, model, count)
+        drawn, why = "prior", f"what they were learnt from is not there: {error}"
     plane, shares = principal_plane(option)
     r2 = [_r2(plane, column) for column in change.T]
     picture = json_safe({"shares": shares, "changes": change.T, "r2": r2}, 3) | {"size": option.shape[1]}
@@ -66,14 +66,6 @@ def _origin(folder: Path, config: OptionsConfig) -> tuple[Path, OptionsConfig]:
     with contextlib.suppress(ConfigError):
         config = home.config().options
     return home.path, config
-
-
-def _window_codes(
-    config: OptionsConfig, model: OptionModel, experience: list[Experience], count: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the codes [N, D] of windows and the changes [N, P] in them."""
-    windows = jax.device_get(encode_windows(as_arrays(config), model, experience, jax.random.key(0), count))
-    return windows.mean, windows.end - windows.start
 
 
 def _prior_codes(config: OptionsConfig, model: OptionModel, count: int) -> tuple[np.ndarray, np.ndarray]:
