@@ -34,24 +34,21 @@ if TYPE_CHECKING:
     from taic_jax.rl.ppo import Agent, train
 
 _MODULES = {
-    "analysis.evaluate": ("evaluate", "record"),
-    "analysis.measures": ("measure_option_space",),
-    "analysis.statistics": ("bootstrap_interval", "iqm"),
-    "config": (
-        "CollectConfig", "Config", "EnvConfig", "EvaluateConfig", "FineTuneConfig", "OptionsConfig", "PPOConfig",
-        "TrainConfig",
-    ),
-    "config_io": ("load_config",),
-    "envs": ("AutoReset", "Env", "State", "environment_names", "make_env"),
-    "artifacts.experience": ("collect",),
-    "options.dataset": ("Experience",),
-    "options.execution": ("Executor", "IdentityExecutor", "OptionExecutor", "make_executor"),
-    "options.learning": ("learn",),
-    "options.model": ("OptionModel",),
-    "pipeline": ("run_pipeline",),
-    "rl.ppo": ("Agent", "train"),
-}  # fmt: skip
-_HOME = {name: module for module, names in _MODULES.items() for name in names}
+    "analysis.evaluate": "evaluate record",
+    "analysis.measures": "measure_option_space",
+    "analysis.statistics": "bootstrap_interval iqm",
+    "config": "CollectConfig Config EnvConfig EvaluateConfig FineTuneConfig OptionsConfig PPOConfig TrainConfig",
+    "config_io": "load_config",
+    "envs": "AutoReset Env State environment_names make_env",
+    "artifacts.experience": "collect",
+    "options.dataset": "Experience",
+    "options.execution": "Executor IdentityExecutor OptionExecutor make_executor",
+    "options.learning": "learn",
+    "options.model": "OptionModel",
+    "pipeline": "run_pipeline",
+    "rl.ppo": "Agent train",
+}
+_HOME = {name: module for module, names in _MODULES.items() for name in names.split()}
 
 __all__ = sorted(["__version__", *_HOME])  # pyright: ignore[reportUnsupportedDunderAll]
 

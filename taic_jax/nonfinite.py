@@ -61,7 +61,11 @@ def guarded(step: Callable[..., tuple[Any, dict, Any]]) -> Callable[..., tuple[G
         code = jnp.where(guard.code == FINITE, metrics.pop("nonfinite"), guard.code)
         going = code == FINITE
         state = select(going, after, guard.state)
-        metrics = jax.tree.map(lambda x: select(going, x, jnp.full_like(x, jnp.nan)), metrics)
-        return Guarded(state, code, guard.step + going.astype(jnp.int32)), metrics, extra
+        return Guarded(state, code, guard.step + going.astype(jnp.int32)), without_stopped(metrics, code), extra
 
     return call
+
+
+def without_stopped(results: Any, code: Int[Array, " K"]) -> Any:
+    """Return results [K, ...] with NaN for the seeds that stopped."""
+    return jax.tree.map(lambda x: select(code == FINITE, x, jnp.full_like(x, jnp.nan)), results)

@@ -9,44 +9,26 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
+from taic_jax import trainer
 from taic_jax.artifacts.experience import EXPERIENCE, ExperienceStore, gather_experience, num_blocks
 from taic_jax.artifacts.models import OPTIONS, POLICY, describe, load_options, load_policy, save_options, save_policy
-from taic_jax.config import (
-    COLLECT,
-    Config,
-    ConfigError,
-    Shard,
-    collector_is_baseline,
-    experience_ticks,
-    impossible,
-    needs_collect,
-)
+from taic_jax.config import COLLECT, Config, ConfigError, Shard, collector_is_baseline, impossible, needs_collect
 from taic_jax.envs import environment_options, make_env
 from taic_jax.envs.base import Env
 from taic_jax.envs.errors import RenderingError, UnknownNameError
 from taic_jax.networks import PolicyParams
-from taic_jax.nonfinite import FINITE
+from taic_jax.nonfinite import without_stopped
 from taic_jax.options import learning
 from taic_jax.options.dataset import Dataset, Experience, holds_out, make_dataset
 from taic_jax.options.model import OptionModel
 from taic_jax.rl.normalize import Statistics
 from taic_jax.runtime.devices import make_devices
 from taic_jax.runtime.driver import Run, drive
+from taic_jax.runtime.files import save_json
 from taic_jax.runtime.run_folder import RunFolder, Summary
 from taic_jax.summary import as_summary, write_video
-from taic_jax.trainer import (
-    Trained,
-    agents_of_rows,
-    assess_rows,
-    init_learning,
-    init_rows,
-    learn_rows,
-    make_trainer,
-    step_rows,
-    steps_per_log,
-)  # fmt: skip
+from taic_jax.trainer import Trained
 
 
 def run_pipeline(
@@ -91,8 +73,8 @@ def run_pipeline(
             # If experience comes from the task itself, the collector is the flat baseline.
             done = collector if name == "flat" and collector_is_baseline(config) else None
             methods[name] = done or train_baseline(run, env, name, policy)
-    summary = as_summary(run, {name: {"first": x.first, "last": x.last} for name, x in methods.items()})
-    run.folder.save_summary(summary)
+    summary = as_summary(run, methods)
+    save_json(run.folder.summary_path, summary)
     try:
         write_video(run, env, methods["taic"].agent)
     except RenderingError as error:  # nothing else depends on it, and all results are saved
@@ -188,29 +170,29 @@ def _train(
 
     A policy that begins from another one still explores anew, with the config's standard deviation.
     """
-    make, rows, keys = partial(make_trainer, stage, env), (run.config, model), run.stage_keys(stage)
-    state = jax.jit(partial(init_rows, make))(rows, keys)
+    make, rows, keys = partial(trainer.make_trainer, stage, env), (run.config, model), run.stage_keys(stage)
+    state = jax.jit(partial(trainer.init_rows, make))(rows, keys)
     if begin:
         params = begin[0].replace(log_std=state.params.log_std)
         state = state.replace(params=params, obs_statistics=begin[1])
-    compiled = _compile_rows(run, stage, partial(assess_rows, make), rows, run.stage_keys("evaluate"), state)
+    compiled = _compile_rows(run, stage, partial(trainer.assess_rows, make), rows, run.stage_keys("evaluate"), state)
 
     def assess(state: Any) -> dict:
         with run.logger.doing(f"{stage}: evaluating"):
             return jax.device_get(compiled(rows, run.stage_keys("evaluate"), state))
 
     first = assess(state)
-    trainer, step, population = make(*rows), partial(step_rows, make), run.population if stage == "train" else None
+    one, step, population = make(*rows), partial(trainer.step_rows, make), run.population if stage == "train" else None
     if population:
         state, step = population.begin(state, run.config, keys), population.evolving(step)
     state = drive(
         run, stage, step, state, rows,
-        num_steps=trainer.num_steps, unit=trainer.unit, ticks=trainer.unit * len(keys), after=after,
+        num_steps=one.num_steps, unit=one.unit, ticks=one.unit * len(keys), after=after,
     )  # fmt: skip
     state = state.state if population else state
-    last = _without_stopped(assess(state), run.stopped[stage].code != FINITE)
-    run.logger.log("evaluate", trainer.ticks, {f"{stage}/{name}": x["return"] for name, x in last.items()})
-    return Trained(agents_of_rows(make, rows, state), first, last)
+    last = without_stopped(assess(state), jnp.asarray(run.stopped[stage].code))
+    run.logger.log("evaluate", one.ticks, {f"{stage}/{name}": x["return"] for name, x in last.items()})
+    return Trained(trainer.agents_of_rows(make, rows, state), first, last)
 
 
 def _compile_rows(run: Run, stage: str, function: Callable[..., Any], *args: Any) -> Callable[..., Any]:
@@ -219,31 +201,26 @@ def _compile_rows(run: Run, stage: str, function: Callable[..., Any], *args: Any
     return lambda *args: run.rows(compiled(*run.devices.place(args)))
 
 
-def _without_stopped(results: Any, stopped: np.ndarray) -> Any:
-    """Return results [K, ...] with NaN for the seeds that stopped."""
-    return jax.tree.map(lambda x: np.where(stopped.reshape((-1,) + (1,) * (x.ndim - 1)), np.nan, x), results)
-
-
 def collect(run: Run, env: Env) -> Trained:
     """Train flat PPO, save its ticks as experience, and the policy as the artifact `policy`."""
     config = run.config.collect
-    if experience_ticks(config) < config.ticks:
-        run.logger.say(f"collect: of {config.ticks:,} ticks the newest {experience_ticks(config):,} are kept")
-    store = ExperienceStore(run.dir / EXPERIENCE, num_blocks(config), describe(env) | {"seeds": len(run.keys)})
+    if 0 < config.capacity < config.ticks:
+        run.logger.say(f"collect: of {config.ticks:,} ticks the newest {config.capacity:,} are kept")
+    store = ExperienceStore(run.folder.path / EXPERIENCE, num_blocks(config), describe(env) | {"seeds": len(run.keys)})
     trained = _train(run, env, "collect", after=store.write)
-    save_policy(run.dir / POLICY, trained.agent, env)
+    save_policy(run.folder.path / POLICY, trained.agent, env)
     return trained
 
 
 def learn(run: Run, env: Env) -> OptionModel:
     """Learn one option model per seed from the experience and save it as the artifact `options`."""
     config, dataset = run.config.options, select_windows(run, env)
-    state = jax.jit(partial(init_learning, env))(config, run.stage_keys("learn"))
+    state = jax.jit(partial(trainer.init_learning, env))(config, run.stage_keys("learn"))
     if config.steps:  # without steps D stays random
-        unit = steps_per_log(config)
-        state = drive(run, "learn", learn_rows, state, config, dataset, num_steps=config.steps // unit, unit=unit)
+        step, unit = trainer.learn_rows, trainer.steps_per_log(config)
+        state = drive(run, "learn", step, state, config, dataset, num_steps=config.steps // unit, unit=unit)
     model = learning.as_model(state, dataset)
-    save_options(run.dir / OPTIONS, model, env, config)
+    save_options(run.folder.path / OPTIONS, model, env, config)
     return model
 
 
@@ -257,7 +234,7 @@ def select_windows(run: Run, env: Env) -> Dataset:
     config, rows, seeds = run.config.options, len(run.keys), run.config.seeds
     names = config.experience or (COLLECT,)
     sources = [
-        gather_experience(run.dir, env, rows)
+        gather_experience(run.folder.path, env, rows)
         if name == COLLECT
         else _for_points(gather_experience(Path(name), env, seeds), rows // seeds)
         for name in names
@@ -284,7 +261,7 @@ def train_over_options(run: Run, env: Env, model: OptionModel) -> Trained:
     trained = _train(run, env, "train", model)
     if config.train.fine_tune.epochs:
         executor: Any = trained.agent.executor
-        save_options(run.dir / "options_fine_tuned", executor.model, env, config.options)
+        save_options(run.folder.path / "options_fine_tuned", executor.model, env, config.options)
     return trained
 
 

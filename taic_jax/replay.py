@@ -32,7 +32,9 @@ def replay(dump: Path) -> str | None:
     Raises:
       ArtifactError: it is not a dump, or was written by another version.
     """
-    dumped = _read(dump)
+    dumped = read_description(dump) or {}
+    if not set(FIELDS) <= set(dumped):
+        raise ArtifactError(f"{dump}: expected a folder under dumps of a run, where a seed stopped; got none")
     run_dir = dump.absolute().parents[1]
     config = RunFolder(run_dir).config()
     env, source = make_envs(config)
@@ -56,18 +58,11 @@ def _stage(run: Run, env: Env, source: Env, stage: str) -> tuple[Any, Any, tuple
     if stage == "learn":
         states = jax.eval_shape(partial(init_learning, source), config.options, keys)
         return learn_rows, states, (config.options, select_windows(run, source))
-    folder = Path(config.options.source or run.dir)
+    folder = Path(config.options.source or run.folder.path)
     model = load_options(folder, env, config.options, len(keys)) if stage == "train" else None
     make = partial(make_trainer, stage, source if stage == COLLECT else env)
     states = jax.eval_shape(partial(init_rows, make), (config, model), keys)
     return partial(step_rows, make), states, ((config, model),)
-
-
-def _read(dump: Path) -> dict[str, Any]:
-    dumped = read_description(dump)
-    if not dumped or not set(FIELDS) <= set(dumped):
-        raise ArtifactError(f"{dump}: expected a folder under dumps of a run, where a seed stopped; got none")
-    return dumped
 
 
 def _first_bad(experience: Any, seed: int) -> str:

@@ -36,11 +36,6 @@ def main(args: Sequence[str] | None = None) -> int:
     return answer(args, PROGRAM, Command, execute)
 
 
-def parse(args: Sequence[str]) -> Command:
-    """Parse and check the arguments, as `command_line.parse` does."""
-    return command_line.parse(args, PROGRAM, Command)
-
-
 def _check_hosts(command: Command) -> None:
     hosts, host, last = command.hosts, command.host, command.hosts - 1
     if hosts < 1:

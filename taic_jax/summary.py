@@ -2,7 +2,6 @@
 
 import subprocess
 from collections.abc import Mapping
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +18,11 @@ from taic_jax.envs.base import Env
 from taic_jax.envs.rendering import write_webp
 from taic_jax.nonfinite import FINITE, QUANTITIES
 from taic_jax.rl.ppo import Agent, num_iterations
+from taic_jax.runtime.checkpoint import version_of
 from taic_jax.runtime.driver import Run, Stopped
 from taic_jax.runtime.files import atomic_file, json_safe, writes_here
 from taic_jax.runtime.run_folder import Method, Summary
+from taic_jax.trainer import Trained
 
 PACKAGES = ("taic_jax", "jax", "jaxlib", "flax", "optax", "brax", "mujoco", "mujoco-mjx", "orbax-checkpoint")
 MIB = 2**20
@@ -56,19 +57,16 @@ def plan(config: Config, env: Env, source: Env) -> str:
     return "\n".join(lines)
 
 
-def as_summary(run: Run, methods: Mapping[str, Mapping[str, Any]]) -> Summary:
-    """Return the contents of `summary.json`, from a run after its last stage.
-
-    `methods` are, by name, the evaluations `first` and `last` of `trainer.Trained`.
-    """
+def as_summary(run: Run, methods: Mapping[str, Trained]) -> Summary:
+    """Return the contents of `summary.json`, from a run after its last stage, and from its policies by method."""
     clock = run.clock
     return {
         "ticks": clock.ticks,
         "ticks_per_second": clock.ticks / clock.run if clock.run else None,
         "seconds": {"compile": clock.compile, "run": clock.run},
         "stopped": {stage: _stopped(seeds) for stage, seeds in run.stopped.items() if (seeds.code != FINITE).any()},
-        "methods": {name: _method(**evaluations) for name, evaluations in methods.items()},
-        "versions": {name: _version(name) for name in PACKAGES},
+        "methods": {name: _method(x.first, x.last) for name, x in methods.items()},
+        "versions": {name: version_of(name) for name in PACKAGES},
         "commit": commit(),
     }
 
@@ -121,14 +119,6 @@ def _durations(counts: np.ndarray) -> dict[str, Any]:
     return {**summarize(means), "histogram": json_safe(counts.sum(axis=0) / counts.sum())}
 
 
-def _version(name: str) -> str | None:
-    """Return the installed version, or None: a bare checkout of this package has none."""
-    try:
-        return metadata.version(name)
-    except metadata.PackageNotFoundError:
-        return None
-
-
 def commit() -> str | None:
     """Return the git commit of the checkout this package runs from, with `-dirty` if the package was changed, or None.
 
@@ -151,5 +141,5 @@ def write_video(run: Run, env: Env, agent: Agent) -> None:
     agent = jax.device_get(jax.tree.map(lambda x: x[0], agent))
     physics = jax.jit(lambda agent, key: record(env, agent, key, ticks))(agent, run.stage_keys("video")[0])
     frames = env.render(jax.device_get(physics))
-    with atomic_file(run.dir / "video.webp") as file:
+    with atomic_file(run.folder.path / "video.webp") as file:
         write_webp(file, frames, env.dt)

@@ -10,12 +10,16 @@ from pathlib import Path
 
 import pytest
 
-from taic_jax import __version__, run
+from taic_jax import __version__, command_line, run
 from taic_jax.config import CONFIG_CLASSES, Config, ConfigError
 from taic_jax.config_io import load_config, to_yaml
-from taic_jax.run import main, parse
+from taic_jax.run import PROGRAM, Command, main
 from taic_jax.runtime.checkpoint import ArtifactError
 from taic_jax.runtime.signals import Interrupted
+
+
+def parse(args):
+    return command_line.parse(args, PROGRAM, Command)
 
 
 @pytest.fixture(autouse=True)

@@ -23,6 +23,7 @@ from taic_jax.experiments.evidence.table import TABLE, TableError, append_row, c
 from taic_jax.pipeline import collect, make_envs, run_pipeline, take_over, train_baseline
 from taic_jax.runtime.devices import Devices, make_devices, open_devices
 from taic_jax.runtime.driver import Run
+from taic_jax.runtime.files import save_json
 from taic_jax.runtime.program_cache import keep_programs
 from taic_jax.runtime.run_folder import RunFolder
 from taic_jax.summary import as_summary
@@ -90,7 +91,7 @@ def run_flat(cell: Cell, folder: Path, devices: Devices, resume: bool) -> None:
     _, policy = take_over(config, env, source)
     with Run.open(config, folder, resume=resume, devices=devices) as run:
         trained = collect(run, source) if stage == "collect" else train_baseline(run, env, stage, policy)
-    run.folder.save_summary(as_summary(run, {stage: {"first": trained.first, "last": trained.last}}))
+    save_json(run.folder.summary_path, as_summary(run, {stage: trained}))
 
 
 def show(cells: Sequence[Cell], rows: dict[Key, dict[str, Any]], arguments: Arguments) -> None:

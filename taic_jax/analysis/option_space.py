@@ -41,7 +41,7 @@ def execute(
     env, num_options = AutoReset(env), len(option)
     begin = start(env, executor, num_options, key_start)
     if many:
-        begin, _ = rollout(env, executor, _from_prior, begin, key_warm_up, WARM_UP)
+        begin, _ = rollout(env, executor, lambda obs, noise: always(noise, obs, noise), begin, key_warm_up, WARM_UP)
         begin = begin.replace(ended=jnp.ones_like(begin.ended))
     else:
         first = jax.tree.map(lambda x: jnp.broadcast_to(x[:1], x.shape), begin.env.replace(key=None))
@@ -50,10 +50,6 @@ def execute(
     last, size = jnp.argmax(ticks.ended, axis=0), env.proprioceptive_size
     end = jnp.take_along_axis(ticks.final_obs, last[None, :, None], axis=0)[0]
     return Effects(option, ticks.obs[0, :, :size], end[:, :size], last + 1)
-
-
-def _from_prior(obs: Float[Array, "B S"], noise: Float[Array, "B D"]) -> tuple[Array, Array]:
-    return noise, jnp.zeros(len(noise))
 
 
 def always(option: Float[Array, "B D"], obs: Float[Array, "B S"], noise: Array) -> tuple[Array, Array]:
@@ -81,6 +77,7 @@ class WindowCodes(struct.PyTreeNode):
     end: Array
 
 
+@partial(jax.jit, static_argnames="count")
 def encode_windows(
     config: OptionsConfig,
     model: OptionModel,
@@ -108,8 +105,7 @@ def measure(
     """
     config = as_arrays(config)
     key_prior, key_windows, key_data, *keys = jax.random.split(key, 7)
-    encode = jax.jit(encode_windows, static_argnums=4)
-    windows = jax.device_get(encode(config, model, experience, key_windows, count))
+    windows = jax.device_get(encode_windows(config, model, experience, key_windows, count))
     data = windows.mean + jnp.exp(windows.log_std) * jax.random.normal(key_data, windows.mean.shape)
     prior = jax.random.normal(key_prior, data.shape)
     executor = make_executor(config, model)

@@ -53,7 +53,11 @@ def read_demonstrations(path: Path, proprioceptive_size: int, action_size: int) 
     if sum(len(episode.reward) for episode in episodes) == 0:
         raise ArtifactError(f"{path}: expected demonstrations, got no tick")
     whole = jax.tree.map(lambda *parts: np.concatenate(parts)[:, None], *episodes)
-    return whole.replace(action=_in_bounds(f"{path}: {action_name}", whole.action))
+    largest = whole.action.flat[np.argmax(np.abs(whole.action))]
+    if abs(largest) > 1 + TOLERANCE:
+        expected = f"expected actions in [-1, 1], got {largest:g}: scale them to [-1, 1]"
+        raise ArtifactError(f"{path}: {action_name}: {expected}")
+    return whole.replace(action=np.clip(whole.action, -1, 1))
 
 
 def _find_file(path: Path) -> Path:
@@ -120,7 +124,10 @@ def _as_experience(label: str, sources: dict[str, Any], sizes: tuple[int, int], 
     actions = _numbers(*action, (count, sizes[1]))
     states = _numbers(*obs, (count + num_last, sizes[0]), longer=True)
     rewards = _numbers(*reward, (count,))
-    done = np.logical_or.reduce([_flags(*end, count) for end in ends])
+    for name, source in ends:
+        if _kind(source) != "b" or source.shape != (count,):
+            raise ArtifactError(f"{name}: expected bool [{count}], got {_show(source)}")
+    done = np.logical_or.reduce([source[...] for _, source in ends])
     done[-1:] = True
     return Experience(states[:count], actions, rewards, done)
 
@@ -145,21 +152,6 @@ def _numbers(label: str, source: Any, shape: tuple[int, ...], longer: bool = Fal
     if wrong := np.count_nonzero(~np.isfinite(array)):
         raise ArtifactError(f"{label}: expected finite numbers, got {wrong} of {array.size} that are NaN or infinite")
     return array
-
-
-def _flags(label: str, source: Any, num_ticks: int) -> np.ndarray:
-    """Return an array of NumPy or HDF5 as bool [num_ticks]."""
-    if _kind(source) != "b" or source.shape != (num_ticks,):
-        raise ArtifactError(f"{label}: expected bool [{num_ticks}], got {_show(source)}")
-    return np.array(source[...])
-
-
-def _in_bounds(label: str, action: np.ndarray) -> np.ndarray:
-    """Return actions clipped to [-1, 1], which they may exceed by rounding only."""
-    largest = action.flat[np.argmax(np.abs(action))]
-    if abs(largest) > 1 + TOLERANCE:
-        raise ArtifactError(f"{label}: expected actions in [-1, 1], got {largest:g}: scale them to [-1, 1]")
-    return np.clip(action, -1, 1)
 
 
 def _kind(source: Any) -> str:

@@ -24,7 +24,7 @@ from taic_jax.options.execution import IdentityExecutor
 from taic_jax.rl import ppo
 from taic_jax.rl.rollout import Rollout
 from taic_jax.runtime.checkpoint import ArtifactError
-from taic_jax.runtime.files import DESCRIPTION, atomic_file, save_description, writing
+from taic_jax.runtime.files import DESCRIPTION, atomic_file, save_json, writing
 from taic_jax.types import as_arrays
 
 EXPERIENCE = "experience"
@@ -50,12 +50,10 @@ def collect(config: CollectConfig, env: Env, key: Key[Array, ""]) -> tuple[ppo.A
         state, metrics, ticks, _judgement = ppo.iterate(config.ppo, env, executor, count, state)
         return state, (metrics, as_experience(ticks, env.proprioceptive_size) if keep else None)
 
-    state, metrics = ppo.init(config.ppo, env, executor, key), []
-    if late < count:  # iterations before the experience
-        state, (early, _) = jax.lax.scan(partial(step, False), state, None, count - late)
-        metrics.append(early)
+    state = ppo.init(config.ppo, env, executor, key)
+    state, (early, _) = jax.lax.scan(partial(step, False), state, None, count - late)
     state, (last, blocks) = jax.lax.scan(partial(step, True), state, None, late)
-    metrics = jax.tree.map(lambda *parts: jnp.concatenate(parts), *metrics, last)
+    metrics = jax.tree.map(lambda *parts: jnp.concatenate(parts), early, last)
     experience = jax.tree.map(lambda x: x.reshape((-1, *x.shape[2:])), blocks)
     return ppo.as_agent(config.ppo, executor, state), metrics, experience
 
@@ -77,7 +75,7 @@ class ExperienceStore:
         self.folder, self.capacity = folder, capacity
         with writing(folder):
             folder.mkdir(parents=True, exist_ok=True)
-        save_description(folder, description)
+        save_json(folder / DESCRIPTION, description)
 
     def write(self, iteration: int, block: Experience) -> None:
         """Save the block of one iteration atomically, or raise SaveError, and drop the oldest beyond the capacity."""

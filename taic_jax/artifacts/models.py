@@ -13,7 +13,7 @@ from taic_jax.options.model import OptionModel, Scale, init_params, make_network
 from taic_jax.rl import normalize
 from taic_jax.rl.ppo import Agent, Policy
 from taic_jax.runtime.checkpoint import ArtifactError, load_tree, save_tree
-from taic_jax.runtime.files import DESCRIPTION, read_description, save_description
+from taic_jax.runtime.files import DESCRIPTION, read_description, save_json
 
 OPTIONS, POLICY = "options", "policy"
 
@@ -131,7 +131,7 @@ def _fit(
 
 def _save(folder: Path, tree: Any, description: dict[str, Any]) -> None:
     save_tree(folder, tree)
-    save_description(folder, description)
+    save_json(folder / DESCRIPTION, description)
 
 
 def _load(folder: Path, saved: int, seeds: int, empty: Any) -> Any:

@@ -11,9 +11,8 @@ import numpy as np
 
 from taic_jax.analysis.option_space import encode_windows
 from taic_jax.artifacts.experience import gather_experience
-from taic_jax.artifacts.models import OPTIONS, Body, load_options, read_body
+from taic_jax.artifacts.models import OPTIONS, load_options, read_body
 from taic_jax.config import COLLECT, ConfigError, OptionsConfig
-from taic_jax.options.dataset import Experience
 from taic_jax.options.model import OptionModel
 from taic_jax.report.runs import LoadedRun, run_of
 from taic_jax.runtime.checkpoint import ArtifactError
@@ -26,7 +25,7 @@ def option_plot(run: LoadedRun, count: int) -> dict[str, Any]:
 
     The options are the means of q(o|a) over windows of the model's experience, coloured by the change of state in these
     windows. Without experience they are drawn from the prior, coloured by the change that P predicts from the mean
-    state. A count of 0 omits the picture.
+    state. R^2 is the share of each coordinate's change that is linear in the plane. A count of 0 omits the picture.
     """
     if not count:
         return {"missing": "left out by --options 0"}
@@ -46,11 +45,17 @@ def option_plot(run: LoadedRun, count: int) -> dict[str, Any]:
         return {"missing": str(error)}
     model = jax.tree.map(lambda x: x[0], models)
     try:
-        experience, why = _experience(home, config, body), ""
+        sources = [home if name == COLLECT else Path(name) for name in config.experience or (COLLECT,)]
+        columns = [jax.tree.map(lambda x: x[0], gather_experience(source, body, 1)) for source in sources]
+        windows = jax.device_get(encode_windows(as_arrays(config), model, columns, jax.random.key(0), count))
+        option, change, drawn, why = windows.mean, windows.end - windows.start, "windows", ""
     except (ArtifactError, OSError) as error:
-        experience, why = None, f"what they were learnt from is not there: {error}"
-    codes = _window_codes(config, model, experience, count) if experience else _prior_codes(config, model, count)
-    return _picture(*codes) | {"drawn": "windows" if experience else "prior", "why": why}
+        option, change = _prior_codes(config, model, count)
+        drawn, why = "prior", f"what they were learnt from is not there: {error}"
+    plane, shares = principal_plane(option)
+    r2 = [_r2(plane, column) for column in change.T]
+    picture = json_safe({"shares": shares, "changes": change.T, "r2": r2}, 3) | {"size": option.shape[1]}
+    return picture | json_safe({"x": plane[:, 0], "y": plane[:, 1]}, 4) | {"drawn": drawn, "why": why}
 
 
 def _origin(folder: Path, config: OptionsConfig) -> tuple[Path, OptionsConfig]:
@@ -63,35 +68,12 @@ def _origin(folder: Path, config: OptionsConfig) -> tuple[Path, OptionsConfig]:
     return home.path, config
 
 
-def _experience(folder: Path, config: OptionsConfig, body: Body) -> list[Experience]:
-    """Return the first seed's experience behind the options, or raise ArtifactError or OSError."""
-    sources = [folder if name == COLLECT else Path(name) for name in config.experience or (COLLECT,)]
-    return [jax.tree.map(lambda x: x[0], gather_experience(source, body, 1)) for source in sources]
-
-
-def _window_codes(
-    config: OptionsConfig, model: OptionModel, experience: list[Experience], count: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the codes [N, D] of windows and the changes [N, P] in them."""
-    encode = jax.jit(encode_windows, static_argnums=4)
-    windows = jax.device_get(encode(as_arrays(config), model, experience, jax.random.key(0), count))
-    return windows.mean, windows.end - windows.start
-
-
 def _prior_codes(config: OptionsConfig, model: OptionModel, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Return codes [N, D] drawn from the prior and the changes [N, P] that P predicts from the mean state."""
     option = jax.random.normal(jax.random.key(0), (count, config.size))
     predict = partial(model.predict, jnp.zeros(model.state_size))
     change = np.asarray(jax.vmap(predict)(option)) * np.asarray(model.change_scale.std)
     return np.asarray(option), change + np.asarray(model.change_scale.mean)
-
-
-def _picture(option: np.ndarray, change: np.ndarray) -> dict[str, Any]:
-    """Project codes on two principal components, and add the R^2 of each coordinate's change by these."""
-    plane, shares = principal_plane(option)
-    r2 = [_r2(plane, column) for column in change.T]
-    picture = json_safe({"shares": shares, "changes": change.T, "r2": r2}, 3)
-    return picture | {"size": option.shape[1], **json_safe({"x": plane[:, 0], "y": plane[:, 1]}, 4)}
 
 
 def principal_plane(option: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

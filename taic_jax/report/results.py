@@ -16,7 +16,9 @@ def methods_of(run: LoadedRun) -> list[dict[str, Any]]:
     results = {_stage_of(run, name): _from_summary(method) for name, method in run.methods.items()}
     for stage in run.trained_stages():
         if stage not in results:
-            results[stage] = _from_evaluation(run, stage)
+            returns = {mode: f"evaluate/{stage}/{mode}" for mode in MODES}
+            values = ((mode, per_seed(row, name)) for row in run.of_stage("evaluate") for mode, name in returns.items())
+            results[stage] = {mode: summarize(x) for mode, x in values if x is not None}
     rows = []
     for stage, statistics in results.items():
         ticks, uncounted = pretraining(run, stage)
@@ -39,32 +41,19 @@ def _from_summary(method: dict[str, Any]) -> dict[str, Any]:
     return result
 
 
-def _from_evaluation(run: LoadedRun, stage: str) -> dict[str, Any]:
-    """Return the results of a stage without a summary, from the rows of stage evaluate."""
-    values = ((mode, per_seed(row, f"evaluate/{stage}/{mode}")) for row in run.of_stage("evaluate") for mode in MODES)
-    return {mode: summarize(x) for mode, x in values if x is not None}
-
-
 def histograms_of(run: LoadedRun) -> list[dict[str, Any]]:
     """Return the shares of options of 1..L ticks for each method whose options may last longer than a tick."""
     shares = {_stage_of(run, name): x.get("duration", {}).get("histogram", []) for name, x in run.methods.items()}
     result = [(stage, share, "evaluation after training") for stage, share in shares.items() if len(share) > 1]
     if not result:
         for stage in run.trained_stages():
-            counts = _last_counts(run, stage)
+            rows = (row.get(f"{stage}/durations") for row in reversed(run.of_stage(stage)))
+            last = next((x for x in rows if x and isinstance(x[0], list)), [[]])
+            counts = np.nansum(np.array(last, float), axis=0)  # over all seeds
             of = f"the iteration that ends at {run.ticks(stage):,} ticks of training"
             if len(counts) > 1 and counts.sum():
                 result.append((stage, (counts / counts.sum()).tolist(), of))
     return [{"label": label_of(run, stage), "share": share, "of": of} for stage, share, of in result]
-
-
-def _last_counts(run: LoadedRun, stage: str) -> np.ndarray:
-    """Return the number of options of 1..L ticks in the newest iteration that counted them, over all seeds."""
-    for row in reversed(run.of_stage(stage)):
-        counts = row.get(f"{stage}/durations")
-        if counts and isinstance(counts[0], list):
-            return np.nansum(np.array(counts, float), axis=0)
-    return np.empty(0)
 
 
 def facts_of(run: LoadedRun) -> dict[str, Any]:

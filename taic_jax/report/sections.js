@@ -34,10 +34,7 @@ function heading() {
     notes(data.notes), make("nav", { "aria-label": "Sections" }, links)]);
 }
 
-function durationSection() {
-  const figures = data.runs.flatMap((run) => run.histograms.map((histogram) => durationFigure(run, histogram)));
-  return figures.length > 0 && section("durations", "Durations of options", make("div", { class: "charts small" }, figures));
-}
+const gallery = (id, title, figures) => figures.length > 0 && section(id, title, make("div", { class: "charts small" }, figures));
 
 function durationFigure(run, { label, share, of }) {
   const [width, height] = [320, 190];
@@ -70,18 +67,15 @@ function videoFigure(run) {
   return figure([make("b", {}, run.name), " ", button], { class: "chart video" }, image, still);
 }
 
-function videoSection() {
-  const figures = data.runs.filter((run) => run.video).map(videoFigure);
-  return figures.length > 0 && section("videos", "Videos", make("div", { class: "charts small" }, figures));
-}
-
 readAddress();
 assignColours();
 document.getElementById("main").replaceChildren(...[
   section("results", "Results", make("p", { class: "lead" }, "Returns of the policy as it explores and of its mean options: interquartile mean over seeds (95 % bootstrap interval). Interactions are per seed."), resultTables()),
-  curveSection(), durationSection(), optionSection(),
+  curveSection(),
+  gallery("durations", "Durations of options", data.runs.flatMap((run) => run.histograms.map((histogram) => durationFigure(run, histogram)))),
+  optionSection(),
   data.sweeps.length > 0 && section("sweeps", "Sweeps", data.sweeps.map(sweepTable)),
-  videoSection(),
+  gallery("videos", "Videos", data.runs.filter((run) => run.video).map(videoFigure)),
   section("runs", "What was run", factsTable(), versionsTable()),
   section("configs", "Configs", configTable()),
 ].filter(Boolean));

@@ -232,11 +232,16 @@ def _checksums(arrays: dict[str, np.ndarray]) -> dict[str, int]:
     return {name: zlib.crc32(_bytes(array).data) for name, array in arrays.items()}
 
 
-def _version() -> str:
+def version_of(package: str) -> str | None:
+    """Return the installed version, or None: a bare checkout of this package has none."""
     try:
-        return metadata.version("taic_jax")
-    except metadata.PackageNotFoundError:  # a bare checkout
-        return "not installed"
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def _version() -> str:
+    return version_of("taic_jax") or "not installed"
 
 
 def _show(spec: Spec | None) -> str:

@@ -19,7 +19,7 @@ from taic_jax.config import Config
 from taic_jax.nonfinite import FINITE, QUANTITIES, Guarded, begin, guarded
 from taic_jax.runtime.checkpoint import ArtifactError, Checkpoints, save_tree
 from taic_jax.runtime.devices import Devices
-from taic_jax.runtime.files import save_description, save_json, writes_here
+from taic_jax.runtime.files import DESCRIPTION, save_json, writes_here
 from taic_jax.runtime.hosts import agree
 from taic_jax.runtime.logging import RunLogger
 from taic_jax.runtime.pbt import Members, Population
@@ -119,11 +119,6 @@ class Run:
         with tempfile.TemporaryDirectory() as logs, RunLogger(Path(logs), quiet=True) as logger:
             yield cls(as_rows([point], config.seeds), _keys(config), RunFolder(path), logger)
 
-    @property
-    def dir(self) -> Path:
-        """The folder's path."""
-        return self.folder.path
-
     def stage_keys(self, stage: str) -> jax.Array:
         """Return the seeds' keys [K] of one stage; a seed's key does not depend on the number of seeds."""
         return jax.vmap(partial(jax.random.fold_in, data=STAGE_STREAMS[stage]))(self.keys)
@@ -148,7 +143,7 @@ class Run:
         for seed in np.flatnonzero(codes != before) if before is not None else ():
             self._dump(stage, guard, unit, int(seed))
         if (codes != FINITE).all():
-            dumps = self.dir / DUMPS
+            dumps = self.folder.path / DUMPS
             raise DivergedError(f"{stage}: every seed has stopped, at numbers that are not finite: see {dumps}")
         return codes
 
@@ -157,12 +152,12 @@ class Run:
         code, step = (int(x[seed]) for x in jax.device_get((guard.code, guard.step)))
         quantity = QUANTITIES[code]
         description = {"stage": stage, "seed": seed, "seeds": len(self.keys), "step": step, "after": step * unit}
-        folder = self.dir / DUMPS / f"{stage}-{step * unit}-seed{seed}"
+        folder = self.folder.path / DUMPS / f"{stage}-{step * unit}-seed{seed}"
         evolved = isinstance(guard.state, Members)
         state, config = (guard.state.state, guard.state.config) if evolved else (guard.state, self.config)
         for name, rows in {"state": state, "config": config}.items():
             save_tree(folder / name, jax.tree.map(lambda x: x[seed], rows))
-        save_description(folder, description | {"quantity": quantity})
+        save_json(folder / DESCRIPTION, description | {"quantity": quantity})
         why = f"its {quantity} is not finite; --replay {folder} shows it again"
         print(f"taic_jax: seed {seed} stopped in {stage} after {step * unit:,}: {why}", file=sys.stderr)
 
@@ -219,7 +214,7 @@ def drive(
       DivergedError: every seed has stopped.
       SaveError: a file cannot be written; earlier checkpoints stay.
     """
-    checkpoints = Checkpoints(run.dir / "checkpoints" / stage)
+    checkpoints = Checkpoints(run.folder.path / "checkpoints" / stage)
     guard, first = resume(checkpoints, begin(state, run.inherited(stage)))
     run.clock.ticks += first * ticks
     run.logger.truncate(stage, first * unit)
@@ -229,7 +224,7 @@ def drive(
     guard, args = run.devices.place((guard, args))
     compiled = run.compile(stage, guarded(step), guard, *args, donate=True)
     saved = time.perf_counter()
-    with checkpoints.waited_for(), run.logger.stage(stage, num_steps * unit, done=first * unit):
+    with checkpoints.waited_for(), run.logger.doing(stage, num_steps * unit, done=first * unit):
         for index in range(first, num_steps):
             guard, metrics, extra = compiled(guard, *args)
             metrics, new_codes = jax.device_get(run.rows((metrics, guard.code)))

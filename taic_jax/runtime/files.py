@@ -67,11 +67,6 @@ def save_json(path: Path, tree: Any) -> None:
     save_text(path, json.dumps(tree, indent=2, allow_nan=False) + "\n")
 
 
-def save_description(folder: Path, description: Mapping[str, Any]) -> None:
-    """Write the description of the arrays in a folder, or raise SaveError."""
-    save_json(folder / DESCRIPTION, description)
-
-
 def read_description(folder: Path) -> dict[str, Any] | None:
     """Read a folder's description: None without a JSON file, and {} if the file holds anything but an object."""
     try:

@@ -8,7 +8,7 @@ import contextlib
 import json
 import shutil
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -43,7 +43,7 @@ class RunLogger:
                 with self._path.open("rb+") as file:
                     file.truncate(file.read().rfind(b"\n") + 1)
         self._open()
-        self._display, self._stage = Display(quiet), None
+        self._display = Display(quiet)
 
     def __enter__(self) -> "RunLogger":
         self._display.start()
@@ -53,21 +53,13 @@ class RunLogger:
         self._display.stop()
         self._close()
 
-    @contextlib.contextmanager
-    def stage(self, name: str, total: int, done: int = 0) -> Iterator[None]:
-        """Show the progress of a stage of `total` ticks or steps, `done` of them before a resume."""
-        self._stage = Work(name, total, done, done)
-        with self._display.showing(self._stage):
-            yield
-        self._stage = None
+    def doing(self, name: str, total: int = 0, done: int = 0) -> contextlib.AbstractContextManager[None]:
+        """Show a stage of `total` ticks or steps, `done` before a resume, or other work, as in `train: compiling`."""
+        return self._display.showing(Work(name, total, done, done))
 
     def say(self, text: str) -> None:
         """Print a line among the progress."""
         self._display.say(text)
-
-    def doing(self, text: str) -> contextlib.AbstractContextManager[None]:
-        """Show work without a measure in the context, as in `train: compiling`."""
-        return self._display.showing(Work(text))
 
     def log(self, stage: str, count: int, metrics: Mapping[str, Any], unit: Unit = "ticks") -> None:
         """Write one row, or raise SaveError.
@@ -86,7 +78,7 @@ class RunLogger:
         self._write_events(row)
         with writing(self._events_dir):
             self._events.flush()
-        if work := self._stage:
+        if work := self._display.work:
             work.done, work.unit, work.result = count, unit, _mean(row.get(f"{stage}/return"))
             work.seeds = max(len(value) if isinstance(value, list) else 1 for value in row.values())
             self._display.update(work)

@@ -61,7 +61,7 @@ class Display:
         hidden = quiet or not self._console.is_terminal
         self._progress = Progress(*columns, TimeRemainingColumn(), console=self._console, disable=hidden)
         self._task: TaskID
-        self._work: Work | None = None
+        self.work: Work | None = None
         self._begun: set[str] = set()
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._repeat, daemon=True)
@@ -85,11 +85,11 @@ class Display:
         if not work.total and work.name not in self._begun:
             self._begun.add(work.name)
             self._write(work)
-        self._work = work
+        self.work = work
         try:
             yield
         finally:
-            self._work = None
+            self.work = None
             self._progress.stop_task(task)
             if work.total:
                 self._write(work)
@@ -112,7 +112,7 @@ class Display:
 
     def _repeat(self) -> None:
         while not self._ended.wait(INTERVAL):
-            if work := self._work:
+            if work := self.work:
                 self._write(work)
 
 

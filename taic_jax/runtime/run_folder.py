@@ -5,7 +5,6 @@ import json
 import shutil
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypedDict
 
@@ -13,7 +12,7 @@ import filelock
 
 from taic_jax.config import COLLECT, Config, walk
 from taic_jax.config_io import load_config, to_yaml
-from taic_jax.runtime.files import PARTIAL, SaveError, remove_partial, save_json, save_text, writes_here, writing
+from taic_jax.runtime.files import PARTIAL, SaveError, remove_partial, save_text, writes_here, writing
 from taic_jax.runtime.hosts import agree
 
 LOCK = ".lock"  # file of a run's folder that the process writing there locks
@@ -71,31 +70,15 @@ class BusyError(RunFolderError):
     """A run folder that another process writes."""
 
 
-@dataclass(frozen=True)
 class RunFolder:
     """The files of one run, by name, and their one reader."""
 
-    path: Path
-
-    @property
-    def config_path(self) -> Path:
-        """The resolved config, written before anything else."""
-        return self.path / "config.yaml"
-
-    @property
-    def metrics_path(self) -> Path:
-        """A row per logged iteration."""
-        return self.path / "metrics.jsonl"
-
-    @property
-    def summary_path(self) -> Path:
-        """The results, written when all stages are done."""
-        return self.path / "summary.json"
-
-    @property
-    def clock_path(self) -> Path:
-        """Seconds so far."""
-        return self.path / "clock.json"
+    def __init__(self, path: Path):
+        self.path = path
+        self.config_path = path / "config.yaml"  # the resolved config, written before anything else
+        self.metrics_path = path / "metrics.jsonl"  # a row per logged iteration
+        self.summary_path = path / "summary.json"  # the results, written when all stages are done
+        self.clock_path = path / "clock.json"  # seconds so far
 
     @property
     def begun(self) -> bool:
@@ -122,10 +105,6 @@ class RunFolder:
         lines = self.metrics_path.read_text().splitlines(keepends=True)
         rows = [json.loads(line) for line in lines if line.endswith("\n")]
         return [row for row in rows if stage in (None, row["stage"])]
-
-    def save_summary(self, summary: Summary) -> None:
-        """Write the results, which finishes the run."""
-        save_json(self.summary_path, summary)
 
     @property
     def _is_used(self) -> bool:

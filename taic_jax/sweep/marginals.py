@@ -16,21 +16,19 @@ def draw_marginals(path: Path, axes: Sequence[Axis], points: Sequence[Point], sc
 
     figure = Figure(figsize=(3.2 * len(axes), 3.0), layout="constrained")
     panels = figure.subplots(1, len(axes), sharey=True, squeeze=False)[0]
+    y = np.array(list(scores.values()), float)
     for panel, axis in zip(panels, axes, strict=True):
-        _draw(panel, axis, [points[i][axis.name] for i in scores], np.array(list(scores.values()), float))
+        values = [points[i][axis.name] for i in scores]
+        numeric = all(isinstance(value, int | float) for value in values)
+        x: Any = np.array(values if numeric else [str(value) for value in values])
+        panel.plot(x, y, "o", color="0.4", markersize=4)
+        if not axis.is_range:
+            candidates = [value if numeric else str(value) for value in axis.values]
+            run = [value for value in candidates if np.isfinite(y[x == value]).any()]
+            panel.plot(run, [np.nanmedian(y[x == value]) for value in run], "-", color="C0")
+        if numeric and x.min() > 0 and (axis.logarithmic or x.max() / x.min() >= 10):
+            panel.set_xscale("log")
         panel.set_xlabel(axis.name)
     panels[0].set_ylabel("return, interquartile mean")
     with atomic_file(path) as file:
         figure.savefig(file, format="png", dpi=120)
-
-
-def _draw(panel: Any, axis: Axis, values: list[Any], scores: np.ndarray) -> None:
-    numeric = all(isinstance(value, int | float) for value in values)
-    x: Any = np.array(values if numeric else [str(value) for value in values])
-    panel.plot(x, scores, "o", color="0.4", markersize=4)
-    if not axis.is_range:
-        candidates = [value if numeric else str(value) for value in axis.values]
-        run = [value for value in candidates if np.isfinite(scores[x == value]).any()]
-        panel.plot(run, [np.nanmedian(scores[x == value]) for value in run], "-", color="C0")
-    if numeric and x.min() > 0 and (axis.logarithmic or x.max() / x.min() >= 10):
-        panel.set_xscale("log")

@@ -38,10 +38,8 @@ class Study:
     def ask(self, count: int) -> tuple[list[int], list[Point]]:
         """Return the numbers and the points of `count` new trials."""
         trials = [self._study.ask(self._space) for _ in range(count)]
-        return [trial.number for trial in trials], [self._point(trial.params) for trial in trials]
-
-    def _point(self, params: Point) -> Point:
-        return {name: self._values.get(name, {}).get(value, value) for name, value in params.items()}
+        points = [{name: self._values.get(name, {}).get(x, x) for name, x in trial.params.items()} for trial in trials]
+        return [trial.number for trial in trials], points
 
     def tell(self, trial: int, value: float) -> None:
         """Report the result of a trial, once; one that is not finite counts as failed."""

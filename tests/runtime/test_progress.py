@@ -61,7 +61,7 @@ def test_a_file_gets_a_line_at_least_every_interval(tmp_path, capfd, monkeypatch
         assert len(lines_of(capfd)) >= 2
         with logger.doing("train: compiling"):
             assert lines_of(capfd) == [], "the same is not said again at once"
-        with logger.stage("train", 40, done=20):
+        with logger.doing("train", 40, done=20):
             logger.log("train", 30, {"return": np.array([1.0, 4.0])})
             time.sleep(0.3)
             assert any("train: 75% of 40 ticks, return 2.5, " in line and " left" in line for line in lines_of(capfd))
@@ -77,7 +77,7 @@ def test_a_file_gets_a_line_at_least_every_interval(tmp_path, capfd, monkeypatch
 def test_quiet_is_quiet_everywhere(tmp_path, capfd, monkeypatch, terminal):
     monkeypatch.setenv("FORCE_COLOR", terminal)
     monkeypatch.setattr(progress, "INTERVAL", 0.05)
-    with RunLogger(tmp_path, quiet=True) as logger, logger.doing("compiling"), logger.stage("train", 20):
+    with RunLogger(tmp_path, quiet=True) as logger, logger.doing("compiling"), logger.doing("train", 20):
         logger.say("something")
         logger.log("train", 20, {"return": 1.0})
         time.sleep(0.2)
@@ -91,7 +91,7 @@ def test_a_terminal_gets_a_bar_for_each_stage_and_no_lines(tmp_path, capfd, monk
         logger.say("the newest ticks are kept")
         with logger.doing("train: compiling"):
             time.sleep(0.2)
-        with logger.stage("train", 40, done=20):
+        with logger.doing("train", 40, done=20):
             logger.log("train", 30, {"return": np.array([1.0, 4.0])})
     out, err = capfd.readouterr()
     assert out == "" and err.count("taic_jax: ") == err.count("taic_jax: the newest ticks are kept") == 1
