@@ -84,8 +84,9 @@ def mutants(source: str) -> Iterator[tuple[int, str, str, str]]:
     for node, names in walk(ast.parse(source), []):
         first, last = starts[node.lineno - 1] + node.col_offset, starts[node.end_lineno - 1] + node.end_col_offset
         for new in mutated(node, names):
-            after = ast.unparse(ast.fix_missing_locations(new))
-            yield node.lineno, ast.unparse(node), after, f"{text[:first].decode()}({after}){text[last:].decode()}"
+            before, after = ast.unparse(node), ast.unparse(ast.fix_missing_locations(new))
+            if before != after:
+                yield node.lineno, before, after, f"{text[:first].decode()}({after}){text[last:].decode()}"
 
 
 def run(tree: Path, tests: list[str], limit: int) -> tuple[int, float]:
