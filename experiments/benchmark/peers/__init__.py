@@ -1,6 +1,6 @@
 """Other libraries' PPO at the work of ours, on Gymnasium's own models; each is imported when it is made.
 
-A call of a peer trains for one iteration; `ticks` are those of a call, `gradient_steps` those so far.
+A call of a peer trains for one iteration; `ticks` are those of a call.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
