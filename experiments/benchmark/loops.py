@@ -115,12 +115,6 @@ class Training:
         self.state, metrics = jax.block_until_ready(self._step(self.state))
         self.duration = float(jnp.mean(metrics["duration"]))
 
-    @property
-    def gradient_steps(self) -> int:
-        """Gradient steps of each seed so far."""
-        counts = [leaf for leaf in jax.tree.leaves(self.state.optimizer) if jnp.issubdtype(leaf.dtype, jnp.integer)]
-        return int(counts[0].reshape(-1)[0])
-
 
 def untrained_ticks(env: envs.Env) -> Rollout:
     """Return ticks [T, B] to learn options from: enough of each environment for a held-out part."""

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
 
@@ -29,6 +30,7 @@ from taic_jax.types import as_arrays, as_rows
 
 PATIENCE = 600.0  # Seconds after which a run that has logged nothing is stopped.
 POLL = 0.02
+SPAWN = multiprocessing.get_context("spawn")
 
 
 def starts(task: str) -> dict[str, float]:
@@ -68,11 +70,10 @@ class SeedsApart:
     def __init__(
         self, make_env: Callable[[], envs.Env], config: PPOConfig, seeds: int, options: OptionsConfig | None = None
     ):
-        context = multiprocessing.get_context("spawn")
         self.ticks, self.duration = seeds * config.num_envs * config.rollout_length, 1.0
-        self._pipe, theirs = context.Pipe()
+        self._pipe, theirs = SPAWN.Pipe()
         arguments = (theirs, make_env, config, seeds, options)
-        context.Process(target=_serve, args=arguments, daemon=True).start()  # a daemon ends with this process
+        SPAWN.Process(target=_serve, args=arguments, daemon=True).start()  # a daemon ends with this process
         theirs.close()
 
     def __call__(self) -> None:
@@ -131,7 +132,7 @@ def sweep_costs(sweep: Sweep, runs: int) -> dict[str, int | float]:
     measured apart.
     """
     costs: dict[str, int | float] = {"runs": (total := sweep.points * sweep.seeds), "runs_measured": runs}
-    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:  # with devices of its own
+    with ProcessPoolExecutor(1, SPAWN) as pool:  # with devices of its own
         costs["compile_one_program"], costs["one_program"] = pool.submit(_one_program, sweep).result()
     rows, keys = sweep.rows()
     each = [(jax.tree.map(lambda x, i=i: x[i], rows), keys[i]) for i in range(runs)]
@@ -155,15 +156,12 @@ def _one_program(sweep: Sweep) -> tuple[float, float]:
 
 
 def _processes(sweep: Sweep, count: int) -> None:
-    """Run the first points of a sweep in `count` processes at once."""
-    names = f"from taic_jax.config import PPOConfig; from {__name__} import Sweep, run_alone"
-    code = [f"{names}; run_alone({sweep!r}, {point})" for point in range(count)]
-    for process in [subprocess.Popen([sys.executable, "-W", "ignore", "-c", text]) for text in code]:
-        if process.wait():
-            raise RuntimeError(f"run {sweep} alone: exit code {process.returncode}")
+    """Run the first points of a sweep in `count` new processes at once."""
+    with ProcessPoolExecutor(count, SPAWN) as pool:
+        list(pool.map(partial(_run_alone, sweep), range(count)))
 
 
-def run_alone(sweep: Sweep, point: int) -> None:
+def _run_alone(sweep: Sweep, point: int) -> None:
     """Run one seed of one point of a sweep in this process."""
     keep_programs()
     run = as_arrays(sweep.configs()[point]), jax.random.key(point)

@@ -66,10 +66,10 @@ def measure(arguments: Arguments, task: str, backend: str) -> Row:
     if backend in ("mjx", "warp"):
         num_envs, length = arguments.num_envs_mjx, arguments.length // 4
     row = {"task": task, "backend": backend, "obs": env.observation_size, "act": env.action_size, "envs": num_envs}
-    row |= {"contacts": possible_contacts(env)} if _has_physics(env) else {}
+    row |= {"contacts": possible_contacts(env)} if hasattr(env, "physics") else {}
     actions = random_actions(env, num_envs, length)
     loops = {"ours": stepping(env, actions)}
-    if _has_physics(env) and backend in BARE:
+    if hasattr(env, "physics") and backend in BARE:
         loops["bare"] = BARE[backend](env, actions)
     ours, *bare = interleave(loops, ROUNDS).values()
     row["ticks_per_second"] = ours.median
@@ -83,10 +83,6 @@ def soak(arguments: Arguments, task: str, backend: str) -> Row:
     qpos = np.asarray(stepping(env, actions, lambda before, action, after: after.physics.qpos).run()[1])
     counts = {"states": actions[..., 0].size, "outside": outside(env.arena, qpos), "nan": int(np.isnan(qpos).sum())}
     return {"task": task, "backend": backend} | counts
-
-
-def _has_physics(env: envs.Env) -> bool:
-    return hasattr(env.env, "physics")
 
 
 def possible_contacts(env: envs.Env) -> int:
@@ -123,7 +119,7 @@ def measure_solver(task: str, num_envs: int, length: int) -> Iterator[Row]:
 def rows(arguments: Arguments) -> Iterator[Row]:
     """Yield each row of the table as it is measured."""
     for task in arguments.tasks or (ARENAS if arguments.soak else envs.environment_names()):
-        has_physics = _has_physics(envs.make_env(task))
+        has_physics = hasattr(envs.make_env(task), "physics")
         if arguments.solver:
             yield from measure_solver(task, arguments.num_envs_mjx, arguments.length // 4) if has_physics else ()
             continue

@@ -3,7 +3,7 @@
 Examples for the figures are of the first seed's option model.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from taic_jax.artifacts.experience import EXPERIENCE, read_experience
 from taic_jax.artifacts.models import load_options
 from taic_jax.config import COLLECT, OptionsConfig
 from taic_jax.envs.navigation import MAX_SPEED, Navigation
-from taic_jax.options.dataset import Experience, gather, make_dataset
+from taic_jax.options.dataset import Experience
 from taic_jax.options.execution import make_executor
 from taic_jax.options.model import OptionModel
 from taic_jax.pipeline import make_envs
@@ -65,10 +65,9 @@ def example_space(folder: Path) -> dict[str, Any]:
     """Return options [N, D] drawn from the prior, and the states [N, P] after each, in standard deviations of the
     experience; all begin in one state."""
     config = RunFolder(folder).config()
-    env, source = make_envs(config)
-    model = jax.tree.map(lambda x: x[0], load_options(folder, env, config.options, config.seeds))
-    executor = make_executor(as_arrays(config.options), model)
-    key_options, key_run = jax.random.split(jax.random.key(config.seed))
+    model, _, key = next(each_model(folder))
+    source, executor = make_envs(config)[1], make_executor(as_arrays(config.options), model)
+    key_options, key_run = jax.random.split(key)
     options = jax.random.normal(key_options, (SHOWN, config.options.size))
     effects = jax.jit(option_space.execute, static_argnums=0)(source, executor, options, key_run)
     drawn = {"options": options, "ends": model.state_scale(effects.end)}
@@ -96,18 +95,6 @@ def straightness(paths: Float[np.ndarray, "N I L 2"]) -> np.ndarray:
     return np.linalg.norm(points[:, -1] - points[:, 0], axis=-1) / np.maximum(way, 1e-9)
 
 
-@jax.jit
-def _draw_windows(
-    config: OptionsConfig, model: OptionModel, experience: Experience, key: Array
-) -> tuple[Float[Array, "N D"], Float[Array, "N L 2"]]:
-    """Draw pairs of windows from the selection; return the means of their codes, and their actions."""
-    dataset = make_dataset(experience, config)
-    which = jax.random.randint(key, (2 * PAIRS,), 0, dataset.count)
-    windows = gather(dataset, which, jnp.full(2 * PAIRS, config.length), config.length)
-    means, _ = jax.vmap(model.encode)(windows.actions)
-    return means[:, -1], windows.actions
-
-
 def measure_paths(config: OptionsConfig, model: OptionModel, experience: Experience, key: Array) -> dict[str, Any]:
     """Measure one option model, and return the paths of its first pair and code as the `example`.
 
@@ -117,7 +104,9 @@ def measure_paths(config: OptionsConfig, model: OptionModel, experience: Experie
     """
     config = as_arrays(config)
     key_windows, key_shuffle = jax.random.split(key)
-    codes, actions = _draw_windows(config, model, experience, key_windows)
+    encode = jax.jit(option_space.encode_windows, static_argnums=4)
+    windows = encode(config, model, experience, key_windows, 2 * PAIRS)
+    codes = windows.mean
     first, last = codes[:PAIRS], codes[PAIRS:]
     share = jnp.linspace(0.0, 1.0, STEPS)[None, :, None]
     between = first[:, None] * (1 - share) + last[:, None] * share
@@ -131,7 +120,7 @@ def measure_paths(config: OptionsConfig, model: OptionModel, experience: Experie
     spread = paths[2][..., -1, :].std(axis=2)  # [N, D, 2], over the sweep
     effect = np.sqrt((spread**2).sum(axis=-1).mean(axis=0))
     order = np.argsort(-effect)
-    drawn = np.asarray(as_path(actions))
+    drawn = np.asarray(as_path(windows.actions))
     example = {"interpolated": paths[0][0], "between": drawn[[0, PAIRS]]}
     example |= {"swept": paths[2][0][order], "original": drawn[0]}
     smoothness, shuffled = (float(straightness(x).mean()) for x in paths[:2])
@@ -174,14 +163,9 @@ def recovery_of(rows: Sequence[Row], stage: str) -> tuple[np.ndarray, dict[str, 
     return shares, numbers
 
 
-def has_recovered(numbers: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return which seeds recovered [K]; a seed whose room changes too late or never has not."""
-    return np.nan_to_num(numbers["success_after"]) >= RECOVERED
-
-
-def has_learnt(numbers: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return which seeds reached the goal that reliably before the change [K]."""
-    return np.nan_to_num(numbers["success_before"]) >= RECOVERED
+def is_reliable(shares: np.ndarray) -> np.ndarray:
+    """Return which seeds [K] reached the goal reliably; not those with too few episodes, as before an early change."""
+    return np.nan_to_num(shares) >= RECOVERED
 
 
 def _last_share(reached: np.ndarray, episodes: np.ndarray) -> float:

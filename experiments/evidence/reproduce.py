@@ -19,9 +19,9 @@ from scipy import stats
 
 from taic_jax.analysis.statistics import exact_interval
 from taic_jax.command_line import tell
-from taic_jax.experiments.evidence.measures import PREFIX, has_recovered
-from taic_jax.experiments.evidence.numbers import with_interval, write_numbers
-from taic_jax.experiments.evidence.table import RESULTS, TABLE, EvidenceRows, TableError, read_table, select
+from taic_jax.experiments.evidence import table as evidence
+from taic_jax.experiments.evidence.measures import PREFIX, is_reliable
+from taic_jax.experiments.evidence.table import EvidenceRows, TableError
 
 # Heading, and the number per seed, of each measure in the figures.
 MEASURES = {
@@ -42,8 +42,8 @@ class Arguments:
 
     again: Annotated[Path, tyro.conf.Positional]
     """The table of the reproduced rows, by `evidence --table`."""
-    table: Path = TABLE  # The table to compare with.
-    out: Path = RESULTS / "again.csv"  # The comparison.
+    table: Path = evidence.TABLE  # The table to compare with.
+    out: Path = evidence.RESULTS / "again.csv"  # The comparison.
 
 
 def counterpart(row: dict[str, Any], rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
@@ -64,7 +64,7 @@ def compare(ours: EvidenceRows, theirs: EvidenceRows) -> list[dict[str, Any]]:
         if name in theirs.numbers:
             values, fresh = theirs.numbers[name], ours.numbers[name]
             p = float(stats.mannwhitneyu(values, fresh).pvalue)
-            lines.append((measure, with_interval(values, THEIRS) | with_interval(fresh, OURS), p))
+            lines.append((measure, evidence.with_interval(values, THEIRS) | evidence.with_interval(fresh, OURS), p))
     if "success_after" in theirs.numbers:
         lines.append(("recovered", share(theirs, THEIRS) | share(ours, OURS), ""))
     name = {"task": theirs.task, "method": theirs.method, "seeds": len(theirs.seeds)}
@@ -76,18 +76,18 @@ def compare(ours: EvidenceRows, theirs: EvidenceRows) -> list[dict[str, Any]]:
 
 def share(runs: EvidenceRows, names: Sequence[str]) -> dict[str, float]:
     """Return the share of seeds that recovered, and its exact 95 % interval."""
-    back = has_recovered(runs.numbers)
+    back = is_reliable(runs.numbers["success_after"])
     return dict(zip(names, (float(np.mean(back)), *exact_interval(int(back.sum()), len(back))), strict=True))
 
 
 def write_comparison(arguments: Arguments) -> None:
     """Write the comparison, and print how much of it was reproduced."""
-    committed, fresh = read_table(arguments.table), read_table(arguments.again)
+    committed, fresh = evidence.read_table(arguments.table), evidence.read_table(arguments.again)
     if not fresh:
         raise TableError(f"{arguments.again}: no rows; python -m taic_jax.experiments.evidence --table makes them")
     pairs = [(row, counterpart(row, committed)) for row in fresh]
-    lines = [line for pair in pairs for line in compare(*(select([x], x["task"], x["method"]) for x in pair))]
-    write_numbers(lines, arguments.out)
+    lines = [line for pair in pairs for line in compare(*(evidence.select([x], x["task"], x["method"]) for x in pair))]
+    evidence.write_numbers(lines, arguments.out)
     print(f"{sum(line['within'] for line in lines)} of {len(lines)} within the interval")
 
 

@@ -26,8 +26,7 @@ from taic_jax.config import ConfigError
 from taic_jax.envs.ant_tasks import upside_down
 from taic_jax.envs.base import Env, State
 from taic_jax.envs.wrappers import AutoReset, Wrapper
-from taic_jax.experiments.evidence.numbers import with_interval, write_numbers
-from taic_jax.experiments.evidence.table import RESULTS
+from taic_jax.experiments.evidence.table import RESULTS, with_interval, write_numbers
 from taic_jax.options.execution import Executor, make_executor
 from taic_jax.pipeline import make_envs
 from taic_jax.rl.rollout import RolloutCarry, rollout, start

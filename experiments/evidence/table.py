@@ -1,7 +1,8 @@
 """The table of finished runs, a line of JSON each: the only source of the figures.
 
 A row is one method on one task for some seeds: config and its hash, versions, commit, a curve per seed on a common grid
-of ticks, the numbers per seed before and after training, and of some an example to draw.
+of ticks, the numbers per seed before and after training, and of some an example to draw. Figures and comparisons state
+these numbers over seeds, in tables of their own.
 """
 
 import dataclasses
@@ -13,14 +14,16 @@ from typing import Any
 
 import numpy as np
 
+from taic_jax.analysis.statistics import bootstrap_interval, iqm, probability_of_improvement
 from taic_jax.config import Config, walk
 from taic_jax.experiments.evidence.measures import recovery_of
-from taic_jax.experiments.evidence.numbers import DIGITS
-from taic_jax.runtime.files import json_safe, save_text
+from taic_jax.runtime.files import json_safe, save_table, save_text
 from taic_jax.runtime.run_folder import Row, RunFolder
 
 RESULTS = Path("experiments/results")
 TABLE = RESULTS / "evidence.jsonl"
+DIGITS = 5  # Significant digits of every number in a table.
+BOUNDS = ("", "_low", "_high")
 GRID = 50  # Points of a curve, equally far apart; the last is the end of training.
 EARLIER_DEFAULTS = {"collect.capacity": 1_000_000}  # Fields with another default today.
 OWN = ("seed", "seeds")  # Fields of the seeds alone.
@@ -183,3 +186,29 @@ def select(rows: Sequence[dict[str, Any]], task: str, method: str, minimum: int 
         {k: np.array([x for row in matches for x in row["numbers"][k]], float) for k in matches[0]["numbers"]},
         tuple(remarks),
     )  # fmt: skip
+
+
+def with_interval(values: np.ndarray, names: Sequence[str] = ("iqm", "low", "high")) -> dict[str, float]:
+    """Return the interquartile mean of one number per seed, and its 95 % interval."""
+    return dict(zip(names, (float(iqm(values)), *bootstrap_interval(values)), strict=True))
+
+
+def with_improvement(name: str, values: np.ndarray, others: np.ndarray) -> dict[str, float]:
+    """Return the probability that a seed is better than one of the others, and its 95 % interval."""
+    p, interval = probability_of_improvement(values, others)
+    return {f"{name}{bound}": value for bound, value in zip(BOUNDS, (p, *interval), strict=True)}
+
+
+def write_numbers(rows: Sequence[dict[str, Any]], out: Path, fields: Sequence[str] = ()) -> None:
+    """Write rows of numbers, which may lack some of the fields, as CSV, and print them; an array is one per seed."""
+    texts = [dict.fromkeys(fields, "") | {name: _as_text(value) for name, value in row.items()} for row in rows]
+    save_table(out, texts)
+    for text in texts:
+        print("  ".join(f"{name} {value}" for name, value in text.items() if value not in (None, "")))
+
+
+def _as_text(value: Any) -> Any:
+    """Return floats with the digits of the table, and other values unchanged."""
+    if isinstance(value, np.ndarray):
+        return " ".join(f"{x:.{DIGITS}g}" for x in value)
+    return f"{value:.{DIGITS}g}" if isinstance(value, float) else value

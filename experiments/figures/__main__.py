@@ -11,8 +11,7 @@ from collections.abc import Sequence
 import tyro
 
 from taic_jax.command_line import tell
-from taic_jax.experiments.figures.figure5ab import Figure5ab
-from taic_jax.experiments.figures.figure5c import Figure5c
+from taic_jax.experiments.figures.figure5 import Figure5ab, Figure5c
 from taic_jax.experiments.figures.figure6 import Figure6
 from taic_jax.experiments.figures.figure7 import Figure7
 from taic_jax.experiments.figures.figure8 import Figure8

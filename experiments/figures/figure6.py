@@ -15,11 +15,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Picture
 
 from taic_jax.experiments.evidence.measures import PREFIX
-from taic_jax.experiments.evidence.numbers import with_interval
 from taic_jax.experiments.evidence.plan import METHODS, OTHERS, SPACES
-from taic_jax.experiments.evidence.table import EvidenceRows, TableError, select
+from taic_jax.experiments.evidence.table import EvidenceRows, TableError, with_interval
 from taic_jax.experiments.figures import drawing
-from taic_jax.experiments.figures.frame import Figure, Rows
+from taic_jax.experiments.figures.drawing import Figure, Rows, read_methods
 
 PERPLEXITIES = (10, 30, 90)
 MODELS = 10
@@ -41,12 +40,10 @@ class Figure6(Figure):
 
     def draw(self, rows: Rows) -> tuple[Picture, Rows]:
         rows = [row for row in rows if row["task"] == self.task]
-        present = {row["method"] for row in rows}
-        methods = {name: select(rows, self.task, name, MODELS) for name in METHODS | OTHERS if name in present}
+        methods = read_methods(rows, self.task, dict.fromkeys(METHODS | OTHERS, MODELS))
         lines = [line for runs in methods.values() for line in numbers(runs)]
         if not lines:
-            expected = f"{self.table}: no row of figure {self.number}"
-            raise TableError(f"{expected}; python -m taic_jax.experiments.evidence --only {self.task} makes them")
+            raise self.no_row(f"python -m taic_jax.experiments.evidence --only {self.task}")
         examples = {row["method"]: row["example"] for row in rows if row["method"] in SPACES and row.get("example")}
         remarks = {name: methods[name].remarks if name in methods else ("missing",) for name in SPACES}
         return picture(examples, lines, remarks), lines

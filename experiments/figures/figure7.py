@@ -4,18 +4,17 @@ A panel names the methods with fewer seeds than planned, and the missing ones.
 """
 
 import dataclasses
+from collections.abc import Sequence
 
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure as Picture
 from scipy import stats
 
 from taic_jax.analysis.statistics import iqm, probability_of_improvement
-from taic_jax.experiments.evidence.numbers import BOUNDS, with_improvement, with_interval
 from taic_jax.experiments.evidence.plan import BASELINE, FLAT, METHODS, ROBOTS
-from taic_jax.experiments.evidence.table import EvidenceRows, TableError
+from taic_jax.experiments.evidence.table import BOUNDS, EvidenceRows, TableError, with_improvement, with_interval
 from taic_jax.experiments.figures import drawing
-from taic_jax.experiments.figures.frame import Figure, Panel, Rows, numbers_of, read_panels
+from taic_jax.experiments.figures.drawing import Figure, Methods, Rows, Strip, draw_panels, numbers_of, read_panels
 
 COLOURS = dict(zip(METHODS, drawing.COLOURS, strict=True))
 
@@ -38,11 +37,11 @@ class Figure7(Figure):
     def draw(self, rows: Rows) -> tuple[Picture, Rows]:
         if unknown := set(self.methods) - set(METHODS):
             raise TableError(f"--methods: expected some of {', '.join(METHODS)}, got {min(unknown)}")
-        panels = read_panels(self, rows, self.tasks, {name: METHODS[name] for name in self.methods})
-        return picture(panels), numbers_of(panels, numbers)
+        panels = read_panels(self, rows, self.tasks, {name: METHODS[name][1] for name in self.methods})
+        return picture(panels, self.methods), numbers_of(panels, numbers)
 
 
-def numbers(runs: EvidenceRows, methods: dict[str, EvidenceRows]) -> Rows:
+def numbers(runs: EvidenceRows, methods: Methods) -> Rows:
     """Return the numbers of one method, in one row, beside flat PPO on the same task."""
     last, means, curve = runs.numbers["last"], runs.numbers["mean_option"], runs.curves["return"]
     area = np.nanmean(curve, axis=1)
@@ -73,21 +72,9 @@ def numbers(runs: EvidenceRows, methods: dict[str, EvidenceRows]) -> Rows:
     return [row]
 
 
-def picture(panels: dict[str, Panel]) -> Picture:
+def picture(panels: dict[str, Methods], methods: Sequence[str]) -> Picture:
     """Draw a column per task: over the task's ticks alone, and over these and the ticks of pre-training."""
-    figure, grid = plt.subplots(2, len(panels), figsize=(4.1 * len(panels) + 0.4, 7.6), squeeze=False)
-    for column, (task, (methods, remarks)) in enumerate(panels.items()):
-        for row, axes in enumerate(grid[:, column]):
-            for method, runs in methods.items():
-                ticks, ends = runs.grid + (runs.pretraining if row else 0), runs.numbers["mean_option"]
-                style = COLOURS[method], METHODS[method][0], method in FLAT
-                drawing.draw_curves(axes, ticks, runs.curves["return"], style, ends)
-            if not methods:
-                drawing.empty(axes)
-                continue
-            drawing.interactions(axes, "interactions, pre-training counted in" if row else "interactions with the task")
-        drawing.mark(grid[0, column], task, remarks)
-    for axes in grid[:, 0]:
-        axes.set_ylabel("return of an episode")
-    drawing.add_legend(figure, grid[0], ncols=len(panels))
+    styles = {name: (COLOURS[name], METHODS[name][0], name in FLAT) for name in methods}
+    figure, grid = draw_panels(panels, (Strip(), Strip(pretrained=True)), styles, 7.6, len(panels))
+    grid[1, 0].set_ylabel("return of an episode")
     return figure

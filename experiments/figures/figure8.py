@@ -9,20 +9,18 @@ or of options in open loop.
 import dataclasses
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure as Picture
 from scipy import stats
 
-from taic_jax.experiments.evidence.numbers import BOUNDS, with_improvement, with_interval
 from taic_jax.experiments.evidence.plan import TRANSFERRED, TRANSFERS
-from taic_jax.experiments.evidence.table import EvidenceRows
+from taic_jax.experiments.evidence.table import BOUNDS, EvidenceRows, with_improvement, with_interval
 from taic_jax.experiments.figures import drawing
-from taic_jax.experiments.figures.drawing import BLACK, BLUE, ORANGE, PURPLE, RED
-from taic_jax.experiments.figures.frame import Figure, Panel, Rows, numbers_of, read_panels
+from taic_jax.experiments.figures.drawing import Figure, Methods, Rows, Strip, draw_panels, numbers_of, read_panels
 
 SEEDS = 10
-COLOURS = {"open": ORANGE, "closed": RED, "tuned": PURPLE, "flat": BLACK, "transfer": BLUE}
+COLOURS = {"open": drawing.ORANGE, "closed": drawing.RED, "tuned": drawing.PURPLE, "flat": drawing.BLACK,
+           "transfer": drawing.BLUE}  # fmt: skip
 BASELINES = ("flat", "transfer")
 MEASURES = ("first", "last", "mean_option", "final/success", "final/closest_approach", "final/upside_down")
 LATE = 5  # Last points of a curve whose mean is a measure of training.
@@ -45,8 +43,7 @@ class Figure8(Figure):
     tasks: tuple[str, ...] = TRANSFERS  # Panels.
 
     def draw(self, rows: Rows) -> tuple[Picture, Rows]:
-        methods = {name: (label, SEEDS) for name, (label, _) in TRANSFERRED.items()}
-        panels = read_panels(self, rows, self.tasks, methods)
+        panels = read_panels(self, rows, self.tasks, dict.fromkeys(TRANSFERRED, SEEDS))
         return picture(panels), numbers_of(panels, numbers)
 
 
@@ -68,7 +65,7 @@ def at_goal(runs: EvidenceRows, measure: str) -> dict[str, str]:
     return {"seeds_at_goal": f"{there.sum()}/{there.size}"}
 
 
-def numbers(runs: EvidenceRows, methods: dict[str, EvidenceRows]) -> Rows:
+def numbers(runs: EvidenceRows, methods: Methods) -> Rows:
     """Return the numbers of one method, a row per measure; p is of the worse comparison."""
     rows, others = [], {name: measured(methods[name]) for name in COMPARED if name in methods}
     for measure, values in measured(runs).items():
@@ -86,28 +83,12 @@ def numbers(runs: EvidenceRows, methods: dict[str, EvidenceRows]) -> Rows:
     return rows
 
 
-def picture(panels: dict[str, Panel]) -> Picture:
+def picture(panels: dict[str, Methods]) -> Picture:
     """Draw a column per task: the return, and the share of ticks at the goal if there is one."""
-    goals = any("mean/success" in runs.curves for panel in panels.values() for runs in panel.methods.values())
-    names = ("return", "mean/success")[: 1 + goals]
-    size = 4.1 * len(panels) + 0.4, 3.0 * len(names) + 1.0
-    figure, grid = plt.subplots(len(names), len(panels), figsize=size, squeeze=False)
-    for column, (task, (methods, remarks)) in enumerate(panels.items()):
-        for axes, name in zip(grid[:, column], names, strict=True):
-            curves = {method: runs for method, runs in methods.items() if name in runs.curves}
-            for method, runs in curves.items():
-                style = COLOURS[method], TRANSFERRED[method][0], method in BASELINES
-                ends = runs.numbers["mean_option"] if name == "return" else None
-                drawing.draw_curves(axes, runs.grid, runs.curves[name], style, ends)
-            if curves:
-                drawing.interactions(axes, "interactions with the task")
-            elif methods:
-                axes.set_axis_off()
-            else:
-                drawing.empty(axes)
-        drawing.mark(grid[0, column], task, remarks)
-    grid[0, 0].set_ylabel("return of an episode")
+    goals = any("mean/success" in runs.curves for methods in panels.values() for runs in methods.values())
+    strips = (Strip(), Strip("mean/success"))[: 1 + goals]
+    styles = {name: (COLOURS[name], label, name in BASELINES) for name, (label, _) in TRANSFERRED.items()}
+    figure, grid = draw_panels(panels, strips, styles, 3.0 * len(strips) + 1.0, min(3, 2 * len(panels) - 1))
     if goals:
         grid[1, 1 % len(panels)].set_ylabel("share of ticks within 5 m of the goal")
-    drawing.add_legend(figure, grid[0], ncols=min(3, 2 * len(panels) - 1))
     return figure

@@ -7,10 +7,9 @@ import numpy as np
 
 from taic_jax.analysis.statistics import probability_of_improvement
 from taic_jax.experiments.evidence.measures import PREFIX
-from taic_jax.experiments.evidence.numbers import with_interval
 from taic_jax.experiments.evidence.plan import BASELINE, FLAT, METHODS, OTHERS, ROBOTS
-from taic_jax.experiments.evidence.table import RESULTS, TABLE, EvidenceRows, TableError, read_table
-from taic_jax.experiments.figures.frame import read_methods
+from taic_jax.experiments.evidence.table import RESULTS, TABLE, EvidenceRows, TableError, read_table, with_interval
+from taic_jax.experiments.figures.drawing import read_methods
 from taic_jax.runtime.files import save_text
 
 # Heading, and the number per seed below it.
@@ -48,7 +47,7 @@ class OptionTable:
         """Write the table."""
         rows, lines = read_table(self.table), []
         for task in ROBOTS:
-            methods = read_methods(rows, task, METHODS | OTHERS).methods
+            methods = read_methods(rows, task, dict.fromkeys(METHODS | OTHERS, 1))
             lines += [line(runs, methods.get(BASELINE)) for runs in methods.values()]
         if not lines:
             raise TableError(f"{self.table}: no run of a robot; python -m taic_jax.experiments.evidence makes them")

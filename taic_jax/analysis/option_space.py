@@ -69,10 +69,11 @@ def order(env: Env, config: OptionsConfig, model: OptionModel, key: Key[Array, "
 
 
 class WindowCodes(struct.PyTreeNode):
-    """Codes of N windows, mean and log standard deviation of q(o|a), and the states at the windows' ends."""
+    """Codes of N windows, mean and log standard deviation of q(o|a), the actions, and the states at both ends."""
 
     mean: Array
     log_std: Array
+    actions: Array
     start: Array
     end: Array
 
@@ -90,7 +91,9 @@ def encode_windows(
     drawn = jax.random.randint(key, (count,), 0, dataset.count)
     windows = gather(dataset, drawn, jnp.full(count, config.length), config.length)
     means, log_stds = jax.vmap(model.encode)(windows.actions)
-    return WindowCodes(means[:, -1], log_stds[:, -1], windows.states[:, 0], windows.states[:, -1])
+    return WindowCodes(
+        means[:, -1], log_stds[:, -1], windows.actions, windows.states[:, 0], windows.states[:, -1]
+    )
 
 
 def measure(

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from taic_jax.experiments.evidence.table import EvidenceRows
+from taic_jax.experiments.figures.drawing import adjust
 from taic_jax.experiments.figures.figure7 import numbers
-from taic_jax.experiments.figures.frame import adjust
 
 GRID = np.array([10, 20, 30, 40])
 

@@ -1,17 +1,19 @@
 """Other libraries' PPO at the work of ours, on Gymnasium's own models; each is imported when it is made.
 
-A call of a peer trains for one iteration; `ticks` are those of a call, `gradient_steps` those so far.
+A call of a peer trains for one iteration; `ticks` are those of a call.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
+import jax
+
 from taic_jax.config import PPOConfig
 from taic_jax.envs.adapters.admission import extra
 from taic_jax.envs.errors import MissingExtraError
 from taic_jax.envs.physics.mujoco import num_physical_cores
-from taic_jax.experiments.benchmark.peers.brax_ppo import DoesNotRunError, ticks_per_second
+from taic_jax.experiments.benchmark.peers.brax_ppo import ticks_per_second
 from taic_jax.experiments.benchmark.timing import seconds
 
 # Our own ant has no observations of contact forces (78 entries, all but zero); theirs leaves them out too.
@@ -25,20 +27,15 @@ NO_TASK = "has no such task"
 
 
 def fastest(make: Callable[[int], Any], counts: Iterable[int]) -> tuple[Any, str]:
-    """Make a peer with each number of threads, time its second iteration, and close all but the fastest.
-
-    Return that one and its setting.
-    """
-    best, least, setting = None, float("inf"), ""
-    for threads in counts:
-        peer = make(threads)
+    """Make a peer with each number of threads, close all but the one whose second iteration takes the least time, and
+    return that and its setting."""
+    made = {threads: make(threads) for threads in counts}
+    for peer in made.values():
         peer()
-        taken = seconds(peer)
-        if taken < least:
-            best, peer, least, setting = peer, best, taken, f"{threads} threads"
-        if peer is not None:
-            peer.close()
-    return best, setting
+    best = min(made, key=lambda threads: seconds(made[threads]))
+    for threads in made.keys() - {best}:
+        made[threads].close()
+    return made[best], f"{best} threads"
 
 
 def _make(name: str, task: str, config: PPOConfig, threads: int) -> Any:
@@ -78,6 +75,7 @@ def brax_rounds(
         return {}, {"brax": NO_TASK}
     try:
         rounds = {f"brax/{pipeline}": ticks_per_second(BRAX[task], pipeline, config) for pipeline in pipelines}
-    except DoesNotRunError as error:
-        return {}, {"brax": str(error)}
+    except Exception as error:
+        first = str(error).partition("\n")[0]
+        return {}, {"brax": f"does not run on jax {jax.__version__}: {type(error).__name__}: {first}"}
     return rounds, dict.fromkeys(rounds, "takes no turns with the others")

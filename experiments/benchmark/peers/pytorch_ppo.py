@@ -23,9 +23,8 @@ class EnvPoolPPO:
         self._actor, self._critic = _mlp(S, config.hidden_sizes, A, 0.01), _mlp(S, config.hidden_sizes, 1, 1.0)
         self._log_std = nn.Parameter(torch.full((A,), config.log_std_init))
         self._params = [*self._actor.parameters(), *self._critic.parameters(), self._log_std]
-        self._optimizer = torch.optim.Adam(self._params, lr=config.learning_rate, eps=1e-5)
+        self.optimizer = torch.optim.Adam(self._params, lr=config.learning_rate, eps=1e-5)
         self.obs = self._envs.reset()[0]
-        self.made = self.gradient_steps = 0
 
     def __call__(self) -> None:
         """Train for one iteration."""
@@ -49,7 +48,6 @@ class EnvPoolPPO:
             action = policy.sample()
             clipped = np.clip(action.numpy().astype(np.float64), -1.0, 1.0)
             self.obs, reward, terminated, truncated, _ = self._envs.step(clipped)
-            self.made += len(reward)
             done = torch.as_tensor(terminated | truncated, dtype=torch.float32)
             tick = (obs, action, policy.log_prob(action).sum(1), self._critic(obs)[:, 0],
                     torch.as_tensor(reward, dtype=torch.float32), done)  # fmt: skip
@@ -77,11 +75,10 @@ class EnvPoolPPO:
                 value_loss = 0.5 * (self._critic(obs)[:, 0] - target).square().mean()
                 loss = config.value_weight * value_loss - torch.min(ratio * advantage, clipped * advantage).mean()
                 loss = loss - config.entropy_weight * policy.entropy().sum(1).mean()
-                self._optimizer.zero_grad()
+                self.optimizer.zero_grad()
                 loss.backward()
                 nn.utils.clip_grad_norm_(self._params, config.max_grad_norm)
-                self._optimizer.step()
-                self.gradient_steps += 1
+                self.optimizer.step()
 
 
 def _mlp(size: int, hidden_sizes: tuple[int, ...], outputs: int, scale: float) -> nn.Sequential:

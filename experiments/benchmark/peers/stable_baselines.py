@@ -20,7 +20,7 @@ class StableBaselines:
         self.ticks, self._threads = config.num_envs * config.rollout_length, threads
         self._envs = DummyVecEnv([lambda: gymnasium.make(name, **options)] * config.num_envs)
         sizes = list(config.hidden_sizes)
-        self._model = PPO(
+        self.model = PPO(
             "MlpPolicy", self._envs, learning_rate=config.learning_rate, n_steps=config.rollout_length,
             batch_size=config.minibatch_size, n_epochs=config.epochs, gamma=config.gamma, gae_lambda=config.lambda_,
             clip_range=config.clip, ent_coef=config.entropy_weight, vf_coef=config.value_weight,
@@ -31,18 +31,7 @@ class StableBaselines:
     def __call__(self) -> None:
         """Train for one iteration."""
         torch.set_num_threads(self._threads)
-        self._model.learn(self.ticks, reset_num_timesteps=False)
-
-    @property
-    def made(self) -> int:
-        """Ticks so far."""
-        return self._model.num_timesteps
-
-    @property
-    def gradient_steps(self) -> int:
-        """Gradient steps so far."""
-        states = self._model.policy.optimizer.state.values()
-        return max((int(state["step"]) for state in states), default=0)
+        self.model.learn(self.ticks, reset_num_timesteps=False)
 
     def close(self) -> None:
         """End the processes of its environments."""
