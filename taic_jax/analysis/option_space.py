@@ -91,9 +91,7 @@ def encode_windows(
     drawn = jax.random.randint(key, (count,), 0, dataset.count)
     windows = gather(dataset, drawn, jnp.full(count, config.length), config.length)
     means, log_stds = jax.vmap(model.encode)(windows.actions)
-    return WindowCodes(
-        means[:, -1], log_stds[:, -1], windows.actions, windows.states[:, 0], windows.states[:, -1]
-    )
+    return WindowCodes(means[:, -1], log_stds[:, -1], windows.actions, windows.states[:, 0], windows.states[:, -1])
 
 
 def measure(
