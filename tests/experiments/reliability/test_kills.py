@@ -8,11 +8,13 @@ from taic_jax.experiments.reliability import kills
 
 
 @pytest.mark.timeout(1200)
-def test_five_killed_runs_end_as_if_they_had_not_been(monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", ["kills", "--kills", "5", "--iterations", "4", "--seeds", "1", "--jobs", "2"])
+def test_a_killed_run_and_a_killed_sweep_end_as_if_they_had_not_been(monkeypatch, capsys):
+    # The seed draws the first moment within the run, and the second within the sweep.
+    arguments = ["--kills", "2", "--seed", "18", "--iterations", "4", "--seeds", "1", "--jobs", "2"]
+    monkeypatch.setattr(sys, "argv", ["kills", *arguments])
     assert kills.main() == 0
     out = capsys.readouterr().out
-    assert "5 resumed runs identical, 0 not" in out and " in sweep" in out
+    assert "2 resumed runs identical, 0 not" in out and "1 in sweep" in out
 
 
 def test_differences_are_found():
