@@ -28,5 +28,5 @@ def test_to_view_a_run_writes_nothing_and_needs_no_claim(tmp_path):
     with Run.open(CONFIG, tmp_path, quiet=True) as run:
         before = files_of(tmp_path)
         with Run.view(CONFIG, tmp_path, as_arrays(CONFIG)) as viewed:
-            assert (viewed.stage_keys("learn") == run.stage_keys("learn")).all() and viewed.dir == tmp_path
+            assert (viewed.stage_keys("learn") == run.stage_keys("learn")).all() and viewed.folder.path == tmp_path
         assert files_of(tmp_path) == before
