@@ -25,7 +25,7 @@ TESTS = {
     "execution": "options/test_options.py options/test_termination.py",
     "termination": "options/test_termination.py options/test_algorithm_1.py", "losses": "options/test_termination.py",
     "learning": "rl/test_learning.py options/test_losses.py options/test_algorithm_1.py",
-    "ant_tasks": "envs/test_arenas.py", "dataset": "envs/test_views.py", "evaluate": "test_trainer.py",
+    "ant_tasks": "envs/test_arenas.py", "evaluate": "test_trainer.py",
     "summary": "test_dry_run.py test_transfer.py",
 }  # fmt: skip
 """Tests of a module besides `test_MODULE*.py`."""
