@@ -2,6 +2,7 @@
 
 import jax
 import numpy as np
+import pytest
 
 from taic_jax.rl import normalize
 
@@ -29,18 +30,19 @@ def test_nothing_seen_changes_nothing():
     np.testing.assert_array_equal(normalized(normalize.init((2,)), x), x)
 
 
-def test_rewards_are_divided_by_the_deviation_of_the_discounted_return():
+@pytest.mark.parametrize("unit", [1.0, 0.01])
+def test_rewards_are_divided_by_the_deviation_of_the_discounted_return(unit):
     scale, gamma, B = normalize.init_reward_scale(2), np.float32(0.9), 2
     running, totals = np.zeros(B), []
     for T in (6, 4):  # the discounted return carries over from one rollout to the next
-        reward, done = rng.normal(size=(T, B)).astype(np.float32), rng.random((T, B)) < 0.3
+        reward, done = rng.normal(0.0, unit, (T, B)).astype(np.float32), rng.random((T, B)) < 0.3
         scale, scaled = scale_rewards(scale, reward, done, gamma)
         for t in range(T):
             running = gamma * running + reward[t]
             totals.append(running)
             running = np.where(done[t], 0.0, running)
         np.testing.assert_allclose(scaled, reward / np.std(totals), rtol=1e-4)
-        np.testing.assert_allclose(scale.discounted_return, running, rtol=1e-5)
+        np.testing.assert_allclose(scale.discounted_return, running, rtol=1e-5, atol=1e-6 * unit)
 
 
 def test_scaled_rewards_are_bounded():

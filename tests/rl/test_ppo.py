@@ -9,12 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from probes import Constant, Counting, Observed, OneOf, Repeat, Sign, TwoStep, assert_trees_equal
+from probes import NO, YES, Constant, Counting, Observed, OneOf, Probe, Repeat, Sign, TwoStep, assert_trees_equal
 from scipy import stats
 
 from taic_jax.config import PPOConfig
 from taic_jax.envs import Navigation, TimeLimit
 from taic_jax.networks import Policy, PolicyParams
+from taic_jax.nonfinite import QUANTITIES
 from taic_jax.options.execution import IdentityExecutor
 from taic_jax.rl import normalize, ppo, update
 from taic_jax.rl.returns import Judgement, semi_markov_advantages
@@ -162,6 +163,23 @@ def test_metrics_of_the_task_are_means_over_its_ticks(iterate, first_state):
     _, metrics, ticks = iterate(first_state)
     assert np.std(ticks.final_obs[..., -1]) > 0
     np.testing.assert_allclose(metrics["mean/last"], np.mean(ticks.final_obs[..., -1]), rtol=1e-5)
+
+
+class Blinded(Probe):
+    """One tick, after which nothing is observed; state and reward stay finite."""
+
+    def observe(self, x: jax.Array) -> jax.Array:
+        return jnp.where(x > 0, jnp.nan, x)[None]
+
+    def move(self, x: jax.Array, action: jax.Array) -> tuple[jax.Array, ...]:
+        return jnp.ones(()), jnp.ones(()), YES, NO
+
+
+def test_an_observation_that_is_not_finite_is_named():
+    env, executor, config = Blinded(), IdentityExecutor(1), as_arrays(ONE_STEP)
+    state = jax.jit(partial(ppo.init, config, env, executor))(jax.random.key(0))
+    _, metrics, *_ = jax.jit(partial(ppo.iterate, config, env, executor, ITERATIONS))(state)
+    assert QUANTITIES[metrics["nonfinite"]] == "observation"
 
 
 def pairs(a: jax.Array, b: jax.Array) -> list[tuple[float, float]]:
