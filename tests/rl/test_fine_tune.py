@@ -25,7 +25,7 @@ OPTIONS = OptionsConfig(length=L, size=2, hidden_size=4, mlp_sizes=(4,), decoder
 PPO = as_arrays(
     PPOConfig(num_envs=B, rollout_length=T, epochs=4, minibatch_size=32, hidden_sizes=(4,), log_std_init=-1.0)
 )
-FINE = as_arrays(FineTuneConfig(epochs=4, minibatch_size=32, learning_rate=0.02, std=0.2, kl_weight=0.0))
+FINE = as_arrays(FineTuneConfig(epochs=4, minibatch_size=16, learning_rate=0.02, std=0.2, kl_weight=0.0))
 ITERATIONS = 100
 """Over which step sizes decay."""
 
@@ -95,6 +95,22 @@ def test_likelihoods_are_of_the_actions_that_were_taken(decoder):
     assert rows.tick.min() == 0 and rows.tick.max() == L - 1
     # One standard deviation away the likelihood is exp(-1/2) of the highest.
     np.testing.assert_allclose(np.mean(rows.log_prob), -0.5, atol=0.2)
+
+
+def test_the_divergence_is_the_mean_over_rows_of_that_of_all_actions():
+    """KL of normals with one deviation: half the squared distance of their means in deviations, summed over actions."""
+    options, state = dataclasses.replace(OPTIONS, decoder="closed"), 3
+    networks = make_networks(options, state, 2)
+    learnt, tuned = (init_params(networks, options, jax.random.key(k)) for k in range(2))
+    scale, keys = Scale(jnp.zeros(state), jnp.ones(state)), jax.random.split(jax.random.key(2), 2)
+    executor = make_executor(options, OptionModel(learnt, scale, scale, jnp.ones(()), networks))
+    option, obs = jax.random.normal(keys[0], (5, 2)), jax.random.normal(keys[1], (5, state))
+    rows = fine_tune.Actions(option, obs, jnp.arange(5) % L, jnp.zeros((5, 2)), jnp.zeros(5), jnp.zeros(5))
+    _, (_, kl) = fine_tune.decoder_loss(tuned["decoder"], executor, rows, PPO, FINE)
+    models = executor.model, executor.model.with_decoder(tuned["decoder"])
+    means = [[fine_tune.mean_action(m, L, option[i], obs[i], rows.tick[i]) for m in models] for i in range(5)]
+    expected = np.mean([np.sum((a - b) ** 2) / (2 * 0.2**2) for a, b in np.array(means)])
+    np.testing.assert_allclose(kl, expected, rtol=1e-5)
 
 
 @pytest.mark.parametrize("decoder", ["open", "closed"])
