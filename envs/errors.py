@@ -53,5 +53,5 @@ class ContractError(ValueError):
         super().__init__(f"{environment}: {field}: {problem}")
 
 
-class RenderingError(RuntimeError):
+class RenderingError(RuntimeError, ValueError):
     """This machine cannot draw MuJoCo scenes."""

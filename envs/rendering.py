@@ -1,9 +1,11 @@
 """Pictures of MuJoCo scenes, drawn on the host, and animations."""
 
+import importlib
 import os
 import sys
+import tempfile
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import mujoco
 import numpy as np
@@ -11,8 +13,9 @@ from jax import Array
 from jaxtyping import Float, UInt8
 from PIL import Image
 
-from taic_jax.envs.errors import RenderingError
+from taic_jax.envs.errors import MissingExtraError, RenderingError
 
+FILMS = (".webp", ".gif", ".mp4")
 Frames = UInt8[np.ndarray, "T height width 3"]
 
 
@@ -59,6 +62,50 @@ def _make_renderer(model: mujoco.MjModel, height: int, width: int) -> mujoco.Ren
 
 def write_webp(file: Path | BinaryIO, frames: Frames, dt: float) -> None:
     """Write frames that are `dt` seconds apart as an animation in real time, at most 25 a second."""
-    every = max(round(0.04 / dt), 1)
-    first, *others = [Image.fromarray(frame) for frame in frames[::every]]
-    first.save(file, format="webp", save_all=True, append_images=others, duration=round(1000 * dt * every), loop=0)
+    _animate(file, frames, dt, "webp")
+
+
+def write_film(path: Path, file: BinaryIO, frames: Frames, dt: float) -> None:
+    """Write an animation as `write_webp` does, in the format that the path's ending names, one of FILMS.
+
+    Raises:
+      RenderingError, MissingExtraError: as `check_film`.
+    """
+    check_film(path)
+    if (kind := path.suffix.lower()) != ".mp4":
+        return _animate(file, frames, dt, kind[1:])
+    every = _every(dt)
+    with tempfile.TemporaryDirectory() as folder:
+        film = Path(folder) / "film.mp4"
+        size = frames.shape[2], frames.shape[1]
+        writer = _ffmpeg().write_frames(str(film), size, fps=1 / (dt * every), macro_block_size=2)
+        writer.send(None)
+        for frame in frames[::every]:
+            writer.send(np.ascontiguousarray(frame))
+        writer.close()
+        file.write(film.read_bytes())
+
+
+def check_film(path: Path) -> None:
+    """Raise RenderingError if the name ends in none of FILMS, MissingExtraError for an MP4 without imageio-ffmpeg."""
+    if path.suffix.lower() not in FILMS:
+        raise RenderingError(f"{path}: expected a name that ends in one of {', '.join(FILMS)}")
+    if path.suffix.lower() == ".mp4":
+        _ffmpeg()
+
+
+def _ffmpeg() -> Any:
+    try:
+        return importlib.import_module("imageio_ffmpeg")
+    except ImportError:
+        raise MissingExtraError("imageio-ffmpeg", "video") from None
+
+
+def _every(dt: float) -> int:
+    """Return the ticks between two shown frames."""
+    return max(round(0.04 / dt), 1)
+
+
+def _animate(file: Path | BinaryIO, frames: Frames, dt: float, kind: str) -> None:
+    first, *others = [Image.fromarray(frame) for frame in frames[:: _every(dt)]]
+    first.save(file, format=kind, save_all=True, append_images=others, duration=round(1000 * dt * _every(dt)), loop=0)

@@ -13,7 +13,9 @@ if TYPE_CHECKING:
     from taic_jax.analysis.evaluate import evaluate, record
     from taic_jax.analysis.measures import measure_option_space
     from taic_jax.analysis.statistics import bootstrap_interval, iqm
+    from taic_jax.artifacts.demonstrations import read_demonstrations
     from taic_jax.artifacts.experience import collect
+    from taic_jax.artifacts.models import load_options
     from taic_jax.config import (
         CollectConfig,
         Config,
@@ -26,12 +28,15 @@ if TYPE_CHECKING:
     )
     from taic_jax.config_io import load_config
     from taic_jax.envs import AutoReset, Env, State, environment_names, make_env
+    from taic_jax.envs.adapters import to_gymnasium
+    from taic_jax.handles.load import Handle, load
     from taic_jax.options.dataset import Experience
     from taic_jax.options.execution import Executor, IdentityExecutor, OptionExecutor, make_executor
     from taic_jax.options.learning import learn
     from taic_jax.options.model import OptionModel
     from taic_jax.pipeline import run_pipeline
-    from taic_jax.rl.ppo import Agent, train
+    from taic_jax.rl.agent import Agent
+    from taic_jax.rl.ppo import train
 
 _MODULES = {
     "analysis.evaluate": "evaluate record",
@@ -40,13 +45,18 @@ _MODULES = {
     "config": "CollectConfig Config EnvConfig EvaluateConfig FineTuneConfig OptionsConfig PPOConfig TrainConfig",
     "config_io": "load_config",
     "envs": "AutoReset Env State environment_names make_env",
+    "envs.adapters": "to_gymnasium",
+    "artifacts.demonstrations": "read_demonstrations",
     "artifacts.experience": "collect",
+    "artifacts.models": "load_options",
+    "handles.load": "Handle load",
     "options.dataset": "Experience",
     "options.execution": "Executor IdentityExecutor OptionExecutor make_executor",
     "options.learning": "learn",
     "options.model": "OptionModel",
     "pipeline": "run_pipeline",
-    "rl.ppo": "Agent train",
+    "rl.agent": "Agent",
+    "rl.ppo": "train",
 }
 _HOME = {name: module for module, names in _MODULES.items() for name in names.split()}
 

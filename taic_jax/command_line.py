@@ -3,8 +3,11 @@
 Arguments are parsed and checked before JAX is imported, so that help and mistakes answer at once.
 """
 
+import ast
 import contextlib
+import dataclasses
 import errno
+import inspect
 import io
 import itertools
 import os
@@ -14,18 +17,27 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import tyro
 
 from taic_jax import __version__
-from taic_jax.config import Config, ConfigError, Shard, field_types, impossible, replace
+from taic_jax.config import Config, ConfigError, Shard, field_types, impossible, replace, walk
 from taic_jax.config_io import as_integer, load_config, mistyped, nearest, preset_names, validate
 from taic_jax.runtime.files import SaveError
 from taic_jax.runtime.signals import DivergedError, Interrupted, Signals
 
 DEFAULT_PRESET = "nav2d"
+HELP_ALL = "--help-all"
+COMMON_FIELDS = (
+    "env.name", "env.backend", "env.model", "env.goal", "collect.env", "collect.ticks", "options.experience",
+    "options.length", "options.size", "options.decoder", "options.termination", "options.delta", "options.steps",
+    "train.ticks", "train.baselines", "train.ppo.num_envs", "train.ppo.learning_rate", "train.ppo.gamma",
+    "train.fine_tune.epochs", "evaluate.episodes", "seed", "seeds",
+)  # fmt: skip
+"""The fields of the config that --help shows; --help-all shows all."""
 FAILED, UNWRITTEN = 1, 74  # 74 is the system's "input/output error"
 EXIT_CODES: dict[int, int] = {signal.SIGINT: 130, signal.SIGTERM: 75}  # 75 is the system's "try again"
 C = TypeVar("C", bound="Command")
@@ -57,6 +69,8 @@ class Command:
     seed; auto splits the seeds where there are several."""
     options: Annotated[str, tyro.conf.arg(metavar="RUN")] = ""
     """Run or artifact whose option model is used unchanged; short for --options.source."""
+    init: Annotated[str, tyro.conf.arg(metavar="RUN")] = ""
+    """Run whose policy over options is trained further; short for --train.init and --options.source."""
     config: Annotated[Config, tyro.conf.arg(name=""), tyro.conf.FlagConversionOff] = Config()
 
     @property
@@ -135,6 +149,10 @@ def _fail(code: int, message: str) -> int:
 def parse(args: Sequence[str], program: str, kind: type[C]) -> C:
     """Parse and check the arguments, over the preset or file that they name; raise `ConfigError` at a mistake."""
 
+    if {"-h", "--help"} & set(args):
+        print(short_help(program, kind))
+        raise SystemExit(0)
+
     def parse_over(source: str) -> C:
         description = f"{kind.__doc__}\n\nPresets: {', '.join(preset_names())}."
         return typed(args, program, kind, description, default=kind(source=source, config=load_config(source)))
@@ -155,15 +173,43 @@ def parse(args: Sequence[str], program: str, kind: type[C]) -> C:
         command = parse_over(source)
     if not command.checkpoint_seconds >= 0:
         raise impossible("--checkpoint-seconds", command.checkpoint_seconds, "at least 0")
-    if command.options:
-        command = replace(command, "config.options.source", command.options)
+    if command.init:
+        command = replace(command, "config.train.init", command.init)
+    if source := command.init or command.options:
+        command = replace(command, "config.options.source", source)
     validate(command.config)
     return command
 
 
+def short_help(program: str, kind: type[Command]) -> str:
+    """Return the usage, the command's own options, and those of COMMON_FIELDS, each with its default."""
+    lines, defaults = [f"usage: {program} [CONFIG] [OPTIONS]", "", kind.__doc__ or "", ""], dict(walk(kind()))
+    own = [field.name for field in dataclasses.fields(kind) if field.name not in ("source", "config")]
+    for name in [*own, *(f"config.{name}" for name in COMMON_FIELDS)]:
+        group, _, field = name.rpartition(".")
+        owner = type(attrgetter(group)(kind()) if group else kind())
+        default, option = defaults[name], f"--{name.removeprefix('config.')}".replace("_", "-")
+        default = ", ".join(default) if isinstance(default, tuple) else default
+        value = "" if default in (False, "", None) else f" ({default})"
+        purpose = re.split(r"[;:.](?=\s|$)", " ".join(_documented(owner)[field].split()))[0]
+        lines.append(f"  {option:26} {purpose}{value}")
+    return "\n".join([*lines, "", f"{program} {HELP_ALL} shows every field; presets: {', '.join(preset_names())}."])
+
+
+def _documented(group: type) -> dict[str, str]:
+    """Return the text below each field of a dataclass, also of those that it inherits."""
+    texts = {}
+    for cls in reversed(group.__mro__[:-1]):
+        body: Any = ast.parse(inspect.getsource(cls)).body[0]
+        for field, text in itertools.pairwise(body.body):
+            if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr):
+                texts[ast.unparse(field.target)] = ast.literal_eval(text.value)
+    return texts
+
+
 def typed(args: Sequence[str], program: str, kind: type[K], description: str | None = None, **settings: Any) -> K:
     """Parse into `kind`, a dataclass with defaults; raise `ConfigError` at a mistake. `settings` are for tyro."""
-    if "-h" in args or "--help" in args:  # alone, or tyro leaves the arguments before it out of the help
+    if {"-h", "--help", HELP_ALL} & set(args):  # alone, or tyro leaves the arguments before it out of the help
         args = ["--help"]
     try:
         with contextlib.redirect_stderr(io.StringIO()), _INTEGERS:

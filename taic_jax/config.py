@@ -208,6 +208,8 @@ class TrainConfig:
     baselines: tuple[Literal["flat", "repeat", "total", "transfer"], ...] = ("flat",)
     """Flat PPO beside it: on the task alone; with each action held for options.length ticks; with the ticks of collect
     as well; or from the flat policy of the run that options.source names."""
+    init: str = ""
+    """Run whose policy over options is trained further, with its options (--init for short); empty for a new policy."""
     ppo: PPOConfig = PPOConfig(log_std_init=0.0)
     fine_tune: FineTuneConfig = FineTuneConfig()
 
@@ -244,8 +246,9 @@ CONFIG_CLASSES = (
 COLLECT = "collect"
 """This run's own experience, as a name in `options.experience`."""
 
+TAIC = "taic"
 METHOD_LABELS = {
-    "taic": "options (TAIC)",
+    TAIC: "options (TAIC)",
     "flat": "flat PPO",
     "repeat": "flat PPO, held actions",
     "total": "flat PPO, ticks of both stages",

@@ -67,6 +67,11 @@ def _read_changes(source: str) -> dict:
     return changes
 
 
+def from_mapping(changes: Any) -> Config:
+    """Return the defaults with these changes, nested as in a file, or raise ConfigError."""
+    return _override(Config(), changes)
+
+
 def to_yaml(config: Config) -> str:
     """Write every field of a configuration, so that `load_config` reads the same one back."""
     return yaml.safe_dump(dataclasses.asdict(config), sort_keys=False)
@@ -75,6 +80,11 @@ def to_yaml(config: Config) -> str:
 def preset_names() -> list[str]:
     """List the presets that ship with the package."""
     return sorted(file.name.removesuffix(".yaml") for file in _PRESETS.iterdir() if file.name.endswith(".yaml"))
+
+
+def preset_text(name: str) -> str:
+    """Return the file of a preset."""
+    return (_PRESETS / f"{name}.yaml").read_text()
 
 
 def mistyped(name: str, kind: Any, value: Any) -> ConfigError:
@@ -144,7 +154,7 @@ def _read_text(source: str) -> str:
         if source not in preset_names():
             hint = nearest(source, preset_names()) or f"; there are {', '.join(preset_names())}"
             raise ConfigError(f"unknown preset {source!r}{hint} (a file's name ends in .yaml)")
-        return (_PRESETS / f"{source}.yaml").read_text()
+        return preset_text(source)
     try:
         return Path(source).read_text()
     except (OSError, UnicodeDecodeError) as error:
@@ -207,6 +217,10 @@ def validate(config: Config) -> None:
         raise impossible("options.delta_unit", "quantile", expected, "error")
     if options.since >= options.until:
         raise impossible("options.since", options.since, f"less than options.until = {options.until}", 0.0)
+    if config.train.init and config.train.init != options.source:
+        raise impossible(
+            "options.source", repr(options.source), "the run that train.init names", repr(config.train.init)
+        )
     if "transfer" in baselines and not options.source:
         expected = "with transfer a run with options and a flat policy"
         raise impossible("train.baselines", "none: add --options RUN", expected)

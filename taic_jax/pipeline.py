@@ -5,30 +5,38 @@ import sys
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from taic_jax import trainer
+from taic_jax.artifacts.agents import AGENTS, Weights, load_policy, load_taic, save_agents
 from taic_jax.artifacts.experience import EXPERIENCE, ExperienceStore, gather_experience, num_blocks
-from taic_jax.artifacts.models import OPTIONS, POLICY, describe, load_options, load_policy, save_options, save_policy
-from taic_jax.config import COLLECT, Config, ConfigError, Shard, collector_is_baseline, impossible, needs_collect
+from taic_jax.artifacts.models import OPTIONS, describe, load_options, save_options
+from taic_jax.config import COLLECT, TAIC, Config, ConfigError, Shard, collector_is_baseline, impossible, needs_collect
 from taic_jax.envs import environment_options, make_env
 from taic_jax.envs.base import Env
 from taic_jax.envs.errors import RenderingError, UnknownNameError
-from taic_jax.networks import PolicyParams
 from taic_jax.nonfinite import without_stopped
 from taic_jax.options import learning
 from taic_jax.options.dataset import Dataset, Experience, holds_out, make_dataset
 from taic_jax.options.model import OptionModel
-from taic_jax.rl.normalize import Statistics
+from taic_jax.rl.agent import Agent
 from taic_jax.runtime.devices import make_devices
 from taic_jax.runtime.driver import Run, drive
 from taic_jax.runtime.files import save_json
 from taic_jax.runtime.run_folder import RunFolder, Summary
 from taic_jax.summary import as_summary, write_video
 from taic_jax.trainer import Trained
+from taic_jax.types import Seeds
+
+
+class Result(NamedTuple):
+    """The results of a run: its summary, and the agents of every method by seed (of each point)."""
+
+    summary: Summary
+    agents: dict[str, Seeds[Agent]]
 
 
 def run_pipeline(
@@ -41,8 +49,8 @@ def run_pipeline(
     overwrite: bool = False,
     quiet: bool = False,
     **settings: Any,
-) -> Summary:
-    """Run every stage that is not done yet and return the summary, also written to `summary.json`.
+) -> Result:
+    """Run every stage that is not done yet; return and write the summary and the agents of every method.
 
     Args:
       config: the experiment, for `config.seeds` seeds.
@@ -61,25 +69,28 @@ def run_pipeline(
     """
     devices = make_devices(shard, config)
     env, source = make_envs(config)
-    model, policy = take_over(config, env, source)  # refuses before anything is written
-    model, policy = _for_points((model, policy), len(points or (config,)))
+    inherited = take_over(config, env, source)  # refuses before anything is written
+    model, flat, policy = _for_points(inherited, len(points or (config,)))
     with Run.open(
         config, run_dir, points=points, resume=resume, overwrite=overwrite, quiet=quiet, devices=devices, **settings
     ) as run:
         collector = collect(run, source) if needs_collect(config) else None
         model = learn(run, source) if model is None else model
-        methods = {"taic": train_over_options(run, env, model)}
+        methods = {TAIC: train_over_options(run, env, model, policy)}
         for name in config.train.baselines:
             # If experience comes from the task itself, the collector is the flat baseline.
             done = collector if name == "flat" and collector_is_baseline(config) else None
-            methods[name] = done or train_baseline(run, env, name, policy)
+            methods[name] = done or train_baseline(run, env, name, flat)
+        for name, trained in methods.items():
+            save_agents(run.folder.path / AGENTS / name, trained.agent, env, run.folder.config(), name)
     summary = as_summary(run, methods)
     save_json(run.folder.summary_path, summary)
+    result = Result(summary, {name: Seeds(trained.agent) for name, trained in methods.items()})
     try:
-        write_video(run, env, methods["taic"].agent)
+        write_video(run, env, methods[TAIC].agent)
     except RenderingError as error:  # nothing else depends on it, and all results are saved
         print(f"taic_jax: no video: {error}", file=sys.stderr)
-    return summary
+    return result
 
 
 def check_run(
@@ -129,27 +140,35 @@ def make_envs(config: Config) -> tuple[Env, Env]:
     return env, source
 
 
-def take_over(
-    config: Config, env: Env, source: Env
-) -> tuple[OptionModel | None, tuple[PolicyParams, Statistics] | None]:
-    """Return the option models and flat policies [K] that the config takes from another run, None for neither.
+class Inherited(NamedTuple):
+    """The option models, the collector's policies and those over options [K] of another run, each None if not taken."""
 
-    Seed k takes the k-th, modulo their number. Experience is only checked, by reading that of one seed.
+    model: OptionModel | None = None
+    flat: Weights | None = None
+    policy: Weights | None = None
+
+
+def take_over(config: Config, env: Env, source: Env) -> Inherited:
+    """Return all that the config takes from another run; seed k takes the k-th, modulo their number.
+
+    Experience is only checked, by reading that of one seed.
 
     Raises:
       ArtifactError: the source is missing, or has another body or another structure.
     """
-    model = policy = None
-    if config.options.source:
-        folder = Path(config.options.source)
-        model = load_options(folder, env, config.options, config.seeds)
-        if "transfer" in config.train.baselines:
-            policy = load_policy(folder, env, config.collect.ppo, config.seeds)
-    else:
+    if not config.options.source:
         for name in config.options.experience:
             if name != COLLECT:
                 gather_experience(Path(name), source, 1)
-    return model, policy
+        return Inherited()
+    folder, flat, policy = Path(config.options.source), None, None
+    if config.train.init:
+        model, policy = load_taic(folder, env, config)
+    else:
+        model = load_options(folder, env, config.options, config.seeds)
+    if "transfer" in config.train.baselines:
+        flat = load_policy(folder, env, config.collect.ppo, config.seeds)
+    return Inherited(model, flat, policy)
 
 
 def _for_points(tree: Any, count: int) -> Any:
@@ -164,17 +183,13 @@ def _train(
     model: OptionModel | None = None,
     *,
     after: Callable[[int, Experience], None] | None = None,
-    begin: tuple[PolicyParams, Statistics] | None = None,
+    begin: Weights | None = None,
 ) -> Trained:
-    """Train one policy per seed and evaluate it before and after.
-
-    A policy that begins from another one still explores anew, with the config's standard deviation.
-    """
+    """Train one policy per seed, from untrained weights or from these, and evaluate it before and after."""
     make, rows, keys = partial(trainer.make_trainer, stage, env), (run.config, model), run.stage_keys(stage)
+    one = make(*rows)
     state = jax.jit(partial(trainer.init_rows, make))(rows, keys)
-    if begin:
-        params = begin[0].replace(log_std=state.params.log_std)
-        state = state.replace(params=params, obs_statistics=begin[1])
+    state = one.begin(state, *begin) if begin else state
     compiled = _compile_rows(run, stage, partial(trainer.assess_rows, make), rows, run.stage_keys("evaluate"), state)
 
     def assess(state: Any) -> dict:
@@ -182,7 +197,7 @@ def _train(
             return jax.device_get(compiled(rows, run.stage_keys("evaluate"), state))
 
     first = assess(state)
-    one, step, population = make(*rows), partial(trainer.step_rows, make), run.population if stage == "train" else None
+    step, population = partial(trainer.step_rows, make), run.population if stage == "train" else None
     if population:
         state, step = population.begin(state, run.config, keys), population.evolving(step)
     state = drive(
@@ -202,13 +217,13 @@ def _compile_rows(run: Run, stage: str, function: Callable[..., Any], *args: Any
 
 
 def collect(run: Run, env: Env) -> Trained:
-    """Train flat PPO, save its ticks as experience, and the policy as the artifact `policy`."""
+    """Train flat PPO, save its ticks as experience, and the policies as the artifact `agents/collect`."""
     config = run.config.collect
     if 0 < config.capacity < config.ticks:
         run.logger.say(f"collect: of {config.ticks:,} ticks the newest {config.capacity:,} are kept")
     store = ExperienceStore(run.folder.path / EXPERIENCE, num_blocks(config), describe(env) | {"seeds": len(run.keys)})
     trained = _train(run, env, "collect", after=store.write)
-    save_policy(run.folder.path / POLICY, trained.agent, env)
+    save_agents(run.folder.path / AGENTS / COLLECT, trained.agent, env, run.folder.config(), COLLECT)
     return trained
 
 
@@ -255,16 +270,16 @@ def select_windows(run: Run, env: Env) -> Dataset:
     return dataset
 
 
-def train_over_options(run: Run, env: Env, model: OptionModel) -> Trained:
+def train_over_options(run: Run, env: Env, model: OptionModel, policy: Weights | None = None) -> Trained:
     """Train the policy that acts by choosing options; a fine-tuned D is saved as the artifact `options_fine_tuned`."""
     config = run.config
-    trained = _train(run, env, "train", model)
+    trained = _train(run, env, "train", model, begin=policy)
     if config.train.fine_tune.epochs:
         executor: Any = trained.agent.executor
         save_options(run.folder.path / "options_fine_tuned", executor.model, env, config.options)
     return trained
 
 
-def train_baseline(run: Run, env: Env, name: str, policy: tuple[PolicyParams, Statistics] | None = None) -> Trained:
+def train_baseline(run: Run, env: Env, name: str, policy: Weights | None = None) -> Trained:
     """Train flat PPO on the task, `transfer` from another run's policy: see `TrainConfig.baselines`."""
     return _train(run, env, name, begin=policy if name == "transfer" else None)

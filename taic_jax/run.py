@@ -58,7 +58,7 @@ def execute(command: Command) -> int:
     """Run the experiment, or only print its configuration and plan; return the exit code."""
     _check_hosts(command)
     if command.replay:
-        from taic_jax.replay import replay
+        from taic_jax.handles.replay import replay
 
         report = replay(command.replay)
         print(report or f"{command.replay}: all numbers were finite this time")
@@ -83,7 +83,7 @@ def execute(command: Command) -> int:
     run_dir = command.folder
 
     def work(signals: Signals) -> None:
-        summary = run_pipeline(
+        summary, _ = run_pipeline(
             command.config, run_dir, resume=command.resume, overwrite=command.overwrite, quiet=command.quiet,
             signals=signals, checkpoint_seconds=command.checkpoint_seconds, shard=shard,
         )  # fmt: skip

@@ -17,7 +17,8 @@ from taic_jax.config import COLLECT, METHOD_LABELS, Config, collector_is_baselin
 from taic_jax.envs.base import Env
 from taic_jax.envs.rendering import write_webp
 from taic_jax.nonfinite import FINITE, QUANTITIES
-from taic_jax.rl.ppo import Agent, num_iterations
+from taic_jax.rl.agent import Agent
+from taic_jax.rl.ppo import num_iterations
 from taic_jax.runtime.checkpoint import version_of
 from taic_jax.runtime.driver import Run, Stopped
 from taic_jax.runtime.files import atomic_file, json_safe, writes_here

@@ -13,12 +13,14 @@ from taic_jax.analysis.evaluate import evaluate
 from taic_jax.artifacts.experience import as_experience
 from taic_jax.config import COLLECT, Config, OptionsConfig, PPOConfig
 from taic_jax.envs.base import Env
+from taic_jax.networks import PolicyParams
 from taic_jax.options import learning
 from taic_jax.options.dataset import Dataset, Experience
 from taic_jax.options.execution import Executor, IdentityExecutor, OptionExecutor, make_executor
 from taic_jax.options.learning import LearnState
 from taic_jax.options.model import OptionModel, make_networks
-from taic_jax.rl import fine_tune, ppo
+from taic_jax.rl import fine_tune, normalize, ppo
+from taic_jax.rl.agent import Agent
 from taic_jax.rl.fine_tune import Tuned
 
 STEPS_PER_LOG = 100
@@ -58,6 +60,10 @@ class Trainer:
         """Return the state of an untrained policy."""
         return ppo.init(self.settings, self.env, self.executor, key)
 
+    def begin(self, state: Any, params: PolicyParams, statistics: normalize.Statistics) -> Any:
+        """Return the state with the weights of another policy; it explores anew, with the config's deviation."""
+        return state.replace(params=params.replace(log_std=state.params.log_std), obs_statistics=statistics)
+
     def step(self, state: Any) -> tuple[Any, dict, Experience | None]:
         """Run one iteration; return the next state, metrics and experience."""
         state, metrics, ticks, _ = ppo.iterate(self.settings, self.env, self.executor, self.num_steps, state)
@@ -70,7 +76,7 @@ class Trainer:
         modes = ("return", "return_mean_option")
         return {mode: jax.tree.map(lambda x, i=i: x[i], results) for i, mode in enumerate(modes)}
 
-    def agent(self, state: Any) -> ppo.Agent:
+    def agent(self, state: Any) -> Agent:
         """Return the policy with its executor, ready to act."""
         return ppo.as_agent(self.settings, self.executor, state)
 
@@ -97,13 +103,17 @@ class FineTuneTrainer(OptionTrainer):
         """Return the state of an untrained policy, and the learnt D."""
         return super().init(key), fine_tune.init(self.settings, self.executor)
 
+    def begin(self, state: Any, params: PolicyParams, statistics: normalize.Statistics) -> Any:
+        """Do so with the policy; D is that of the model."""
+        return super().begin(state[0], params, statistics), state[1]
+
     def step(self, state: Any) -> tuple[Any, dict, None]:
         """Run one iteration of the policy and of D; return the next states and the metrics of both."""
         settings = self.settings, self.config.train.fine_tune, self.env, self.executor, self.num_steps
         policy, tuned, metrics = fine_tune.iterate(*settings, *state)
         return (policy, tuned), metrics, None
 
-    def agent(self, state: Any) -> ppo.Agent:
+    def agent(self, state: Any) -> Agent:
         """Return the policy over the fine-tuned options."""
         policy, tuned = state
         return ppo.as_agent(self.settings, fine_tune.tuned_executor(self.executor, tuned.decoder), policy)
@@ -142,7 +152,7 @@ def assess_rows(make: Callable[..., Trainer], rows: Row, keys: Array, states: An
     return jax.vmap(lambda row, key, state: make(*row).assess(key, state))(rows, keys, states)
 
 
-def agents_of_rows(make: Callable[..., Trainer], rows: Row, states: Any) -> ppo.Agent:
+def agents_of_rows(make: Callable[..., Trainer], rows: Row, states: Any) -> Agent:
     """Return the agents [K] of all rows, ready to act."""
     return jax.vmap(lambda row, state: make(*row).agent(state))(rows, states)
 
@@ -167,6 +177,6 @@ def steps_per_log(config: OptionsConfig) -> int:
 class Trained(NamedTuple):
     """A trained policy per seed, leading axis K, and its evaluations before and after training."""
 
-    agent: ppo.Agent
+    agent: Agent
     first: dict[str, dict[str, Array]]
     last: dict[str, dict[str, Array]]

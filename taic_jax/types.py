@@ -2,12 +2,15 @@
 
 Axes, used in every docstring of the package:
 `T` ticks, `B` environments, `N` windows, `L` longest option, `D` option size, `A` action size,
-`S` observation size, `P` size of the proprioceptive slice, `G` sweep points, `K` seeds.
+`S` observation size, `P` size of the proprioceptive slice, `G` sweep points, `K` seeds; `R` rows [T B] of ticks or
+[G K] of programs, `M` rows of a minibatch, `F` features of a row; `X` random numbers that an executor takes in a tick,
+`Z` of policy and executor, D + X.
 """
 
 import dataclasses
-from collections.abc import Sequence
-from typing import Any, TypeVar, get_type_hints
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar, get_type_hints
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +21,24 @@ from taic_jax import config
 Tree = TypeVar("Tree")
 Scalar = Float[Array, ""] | float
 """A leaf of the config: a float from a file, an array after `as_arrays` or in a sweep."""
+
+
+@dataclass(frozen=True)
+class Seeds(Generic[Tree]):
+    """The same thing of every seed: `seeds[k]` is that of seed k, `seeds.rows` all of them, leading axis K."""
+
+    rows: Tree
+
+    def __len__(self) -> int:
+        return len(jax.tree.leaves(self.rows)[0])
+
+    def __getitem__(self, seed: int) -> Tree:
+        if not -len(self) <= seed < len(self):
+            raise IndexError(f"seed {seed}: expected one of the {len(self)} seeds of this run")
+        return jax.tree.map(lambda x: x[seed], self.rows)
+
+    def __iter__(self) -> Iterator[Tree]:
+        return (self[k] for k in range(len(self)))
 
 
 def _register(cls: type) -> None:

@@ -27,10 +27,11 @@ LAYERS = (
     "trainer",
     "summary",
     "pipeline",
-    "replay command_line",
+    "handles command_line",
     "run sweep",
     "report",
     "experiments",
+    "__main__",
 )
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names.split()}
 

@@ -39,7 +39,7 @@ def finished(tmp_path_factory) -> tuple[Path, dict]:
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         Path("paid.py").write_text(PAID)
-        return folder / "run", run_pipeline(config, folder / "run")["methods"]
+        return folder / "run", run_pipeline(config, folder / "run").summary["methods"]
 
 
 def test_evaluations_are_of_the_policy_as_it_explores_and_of_its_mean_before_and_after_training(finished):

@@ -6,6 +6,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from safetensors.numpy import load_file
 from tiny_runs import (
     CONFIG,
     KilledError,
@@ -72,7 +73,7 @@ def methods_of(folder: Path) -> dict:
 
 def test_a_run_with_options_of_another_learns_and_collects_nothing(transferred):
     assert stages_of(transferred) == {"train", "transfer"}
-    assert not any((transferred / name).exists() for name in ("experience", "options", "policy"))
+    assert not any((transferred / name).exists() for name in ("experience", "options", "agents/collect"))
     assert set(methods_of(transferred)) == {"taic", "transfer"}
     assert json.loads((transferred / "summary.json").read_text())["ticks"] == 3 * 2 * 48
     assert {row["stage"] for row in rows_of(transferred)} == {"train", "transfer", "evaluate"}
@@ -103,18 +104,18 @@ def test_the_transferred_policy_starts_where_the_source_run_ended(source, tmp_pa
         return state
 
     env = make_envs(config)[0]
-    _, policy = pipeline.take_over(config, env, env)
+    policy = pipeline.take_over(config, env, env).flat
     monkeypatch.setattr(pipeline, "drive", drive)
     with pipeline.Run.open(config, tmp_path) as run:
         pipeline.train_baseline(run, env, "transfer", policy)
-    saved, (start,) = load_arrays(source / "policy"), states
-    first, second = (saved[f"0.actor.params.Dense_{i}.kernel"] for i in range(2))
+    saved, (start,) = load_file(source / "agents/collect/arrays.safetensors"), states
+    first, second = (saved[f"params.actor.params.Dense_{i}.kernel"] for i in range(2))
     np.testing.assert_array_equal(start.params.actor["params"]["Dense_0"]["kernel"], first[:, :2])
     np.testing.assert_array_equal(start.params.actor["params"]["Dense_1"]["kernel"], second)
-    np.testing.assert_array_equal(start.obs_statistics.mean, saved["1.mean"][:, :2])
+    np.testing.assert_array_equal(start.obs_statistics.mean, saved["obs_statistics.mean"][:, :2])
     # It explores afresh.
     assert (np.asarray(start.params.log_std) == np.float32(config.collect.ppo.log_std_init)).all()
-    assert not (saved["0.log_std"] == np.float32(config.collect.ppo.log_std_init)).all()
+    assert not (saved["params.log_std"] == np.float32(config.collect.ppo.log_std_init)).all()
 
 
 def test_a_transfer_run_that_was_interrupted_ends_as_if_it_had_not_been(source, transferred, tmp_path, monkeypatch):

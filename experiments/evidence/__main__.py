@@ -88,7 +88,7 @@ def run_flat(cell: Cell, folder: Path, devices: Devices, resume: bool) -> None:
     """Train flat PPO alone: `collect`, which saves its experience, or a baseline."""
     config, (stage,) = cell.config, cell.stages.values()
     env, source = make_envs(config)
-    _, policy = take_over(config, env, source)
+    policy = take_over(config, env, source).flat
     with Run.open(config, folder, resume=resume, devices=devices) as run:
         trained = collect(run, source) if stage == "collect" else train_baseline(run, env, stage, policy)
     save_json(run.folder.summary_path, as_summary(run, {stage: trained}))

@@ -9,7 +9,7 @@ from jaxtyping import Array, Key
 
 from taic_jax.envs.base import Env
 from taic_jax.envs.wrappers import AutoReset
-from taic_jax.rl.ppo import Agent
+from taic_jax.rl.agent import Agent
 from taic_jax.rl.rollout import Rollout, count_durations, rollout, start
 from taic_jax.types import Scalar
 
@@ -38,8 +38,13 @@ def evaluate(env: Env, agent: Agent, key: Key[Array, ""], episodes: int, explora
 
 def record(env: Env, agent: Agent, key: Key[Array, ""], ticks: int) -> Any:
     """Return `ticks` ticks of physics [T, ...] of one environment under the mean options, for `env.render`."""
-    run = _run(env, agent, key, 1, ticks, 0.0, lambda state: state.physics)
-    return jax.tree.map(lambda x: x[:, 0], run.extras)
+    return trace(env, agent, key, ticks, 0.0).extras
+
+
+def trace(env: Env, agent: Agent, key: Key[Array, ""], ticks: int, exploration: Scalar = 1.0) -> Rollout:
+    """Return `ticks` ticks [T, ...] of one environment, whose `extras` are the physics for `env.render`."""
+    run = _run(env, agent, key, 1, ticks, exploration, lambda state: state.physics)
+    return jax.tree.map(lambda x: x[:, 0], run)
 
 
 def _run(

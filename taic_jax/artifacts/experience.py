@@ -22,6 +22,7 @@ from taic_jax.envs.base import Env
 from taic_jax.options.dataset import Experience
 from taic_jax.options.execution import IdentityExecutor
 from taic_jax.rl import ppo
+from taic_jax.rl.agent import Agent
 from taic_jax.rl.rollout import Rollout
 from taic_jax.runtime.checkpoint import ArtifactError
 from taic_jax.runtime.files import DESCRIPTION, atomic_file, save_json, writing
@@ -36,7 +37,7 @@ def as_experience(ticks: Rollout, proprioceptive_size: int) -> Experience:
     return Experience(ticks.obs[..., :proprioceptive_size], ticks.action, ticks.reward, done)
 
 
-def collect(config: CollectConfig, env: Env, key: Key[Array, ""]) -> tuple[ppo.Agent, dict[str, Array], Experience]:
+def collect(config: CollectConfig, env: Env, key: Key[Array, ""]) -> tuple[Agent, dict[str, Array], Experience]:
     """Train flat PPO in `env`; pure, so keys may be vmapped.
 
     Return the agent, the metrics of every iteration, and the newest experience [T, B, ...], within the capacity.

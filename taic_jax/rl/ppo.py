@@ -19,8 +19,9 @@ from taic_jax.networks import Policy, PolicyParams
 from taic_jax.nonfinite import first_nonfinite
 from taic_jax.options.execution import Executor
 from taic_jax.rl import normalize
+from taic_jax.rl.agent import Agent
 from taic_jax.rl.returns import Judgement, semi_markov_advantages
-from taic_jax.rl.rollout import DecideFn, Rollout, RolloutCarry, count_durations, rollout, start
+from taic_jax.rl.rollout import Rollout, RolloutCarry, count_durations, rollout, start
 from taic_jax.rl.update import LOSSES, Decisions, Update, make_optimizer, update
 from taic_jax.types import Scalar, as_arrays
 
@@ -35,30 +36,6 @@ class TrainState(struct.PyTreeNode):
     running: RolloutCarry
     key: Array
     iteration: Array
-
-
-class Agent(struct.PyTreeNode):
-    """A policy over options with its parameters, and the executor of the options: all that acting needs."""
-
-    executor: Executor
-    params: PolicyParams
-    obs_statistics: normalize.Statistics
-    policy: Policy = struct.field(pytree_node=False)
-
-    def decide(self, exploration: Scalar = 1.0) -> DecideFn:
-        """Return the policy as a function of raw observations and standard normal noise.
-
-        The noise is scaled by `exploration`: 1 draws options from pi(o|s), 0 takes their mean.
-        """
-        return partial(_decide, self, exploration)
-
-
-def _decide(
-    agent: Agent, exploration: Scalar, obs: Float[Array, "B S"], noise: Float[Array, "B D"]
-) -> tuple[Float[Array, "B D"], Float[Array, " B"]]:
-    distribution: Any = agent.policy.distribution(agent.params, normalize.normalize(agent.obs_statistics, obs))
-    option = distribution.loc + exploration * distribution.scale_diag * noise
-    return option, distribution.log_prob(option)
 
 
 def make_policy(executor: Executor, config: PPOConfig) -> Policy:

@@ -44,7 +44,7 @@ def save_tree(path: Path, tree: Any) -> None:
     path = path.absolute()
     partial = path.with_name(path.name + PARTIAL)  # Orbax would remove the old folder before it writes
     with _saving(path, partial):
-        _begin(partial, _plain(tree), {})()
+        _begin(partial, plain_arrays(tree), {})()
         if writes_here():
             if path.exists():
                 shutil.rmtree(path)
@@ -59,7 +59,14 @@ def load_arrays(path: Path) -> dict[str, np.ndarray]:
 
 def load_tree(path: Path, like: Tree) -> Tree:
     """Read a tree with the names, shapes, dtypes and devices of `like` (arrays or shapes), or raise ArtifactError."""
-    arrays, writer = _read(path)
+    return fit_tree(path, *_read(path), like)
+
+
+def fit_tree(path: Path, arrays: dict[str, np.ndarray], writer: str, like: Tree) -> Tree:
+    """Return arrays by name as a tree like `like`, or raise ArtifactError at their first difference.
+
+    The error names the `path` they are from, and the version of this package that wrote them, if it is another one.
+    """
     named = _by_name(like)
     expected = {name: _spec(leaf) for name, leaf in named.items() if leaf.size}
     stored: dict[str, Spec] = {name: (array.shape, array.dtype) for name, array in arrays.items()}
@@ -98,7 +105,7 @@ class Checkpoints:
         cannot be written; earlier steps stay.
         """
         self.wait()
-        path, arrays = self.directory / str(step), _plain(tree)
+        path, arrays = self.directory / str(step), plain_arrays(tree)
         layout = [[name, array.dtype.name, list(array.shape)] for name, array in arrays.items()]
         packed = np.concatenate([_bytes(array) for array in arrays.values()])
         options = ocp.options.ArrayOptions(saving=ocp.options.ArrayOptions.Saving(use_ocdbt=False))  # for many arrays
@@ -148,7 +155,7 @@ def _begin(path: Path, arrays: dict[str, np.ndarray], extra: dict[str, Any]) -> 
     path.parent.mkdir(parents=True, exist_ok=True)
     if writes_here():
         make_room(path.parent, sum(array.nbytes for array in arrays.values()) + len(arrays) * 2**10 + 2**14)
-    beside = {VERSION: _version(), CHECKSUMS: _checksums(arrays), **extra}
+    beside = {VERSION: _version(), CHECKSUMS: checksums(arrays), **extra}
     return ocp.save_async(str(path), arrays, overwrite=True, custom_metadata=beside).result
 
 
@@ -175,7 +182,7 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], str]:
         beside: Any = stored.custom_metadata or {}
         empty = {name: np.empty(meta.shape, meta.dtype) for name, meta in stored.metadata.items()}
         arrays = ocp.load(str(path.absolute()), empty)
-        sums = _checksums(arrays)
+        sums = checksums(arrays)
         if beside.get(CHECKSUMS, sums) != sums:  # earlier versions wrote none
             raise ValueError
         arrays = _unpack(arrays[PACKED], beside[LAYOUT]) if LAYOUT in beside else arrays
@@ -198,20 +205,20 @@ def _by_name(tree: Any) -> dict[str, Any]:
     return {jax.tree_util.keystr(p, simple=True, separator="."): leaf for p, leaf in jax.tree.leaves_with_path(tree)}
 
 
-def _plain(tree: Any) -> dict[str, np.ndarray]:
+def plain_arrays(tree: Any) -> dict[str, np.ndarray]:
     """Return the leaves by dotted name as NumPy's arrays, without empty ones, which Orbax refuses."""
     named = {name: leaf for name, leaf in _by_name(tree).items() if leaf.size}
     return jax.device_get({name: jax.random.key_data(x) if _is_key(x) else x for name, x in named.items()})
 
 
 def _spec(leaf: Any) -> Spec:
-    """Return the shape and dtype of a leaf of `_plain`."""
+    """Return the shape and dtype of a leaf of `plain_arrays`."""
     plain = jax.eval_shape(jax.random.key_data, leaf) if _is_key(leaf) else leaf
     return plain.shape, plain.dtype
 
 
 def _restore(array: np.ndarray | None, leaf: Any) -> jax.Array:
-    """Undo `_plain` for one leaf, in the form and on the devices of another."""
+    """Undo `plain_arrays` for one leaf, in the form and on the devices of another."""
     if array is None:  # an empty leaf
         return jnp.zeros(leaf.shape, leaf.dtype)
     if _is_key(leaf):
@@ -228,7 +235,8 @@ def _bytes(array: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(array).reshape(-1).view(np.uint8)
 
 
-def _checksums(arrays: dict[str, np.ndarray]) -> dict[str, int]:
+def checksums(arrays: dict[str, np.ndarray]) -> dict[str, int]:
+    """Return the CRC-32 of each array's bytes."""
     return {name: zlib.crc32(_bytes(array).data) for name, array in arrays.items()}
 
 

@@ -107,6 +107,7 @@ class Run:
         folder.prepare(config, resume=resume, overwrite=overwrite)
         logs = contextlib.nullcontext(path) if writes_here() else tempfile.TemporaryDirectory()
         with folder.claimed(), logs as logs, RunLogger(Path(logs), quiet=quiet) as logger:
+            folder.reopen(config)
             clock = Clock.load(folder.clock_path)
             logger.truncate("evaluate", -1)
             rows, keys = as_rows(points, config.seeds), _keys(config, len(points))

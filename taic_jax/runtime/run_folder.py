@@ -70,6 +70,11 @@ class BusyError(RunFolderError):
     """A run folder that another process writes."""
 
 
+def _goes_on(name: str, old: Any, new: Any) -> bool:
+    """Return whether a run goes on with another value: evaluation does not change it, and it may train for longer."""
+    return new == old or name.startswith("evaluate.") or (name == "train.ticks" and new > old)
+
+
 class RunFolder:
     """The files of one run, by name, and their one reader."""
 
@@ -119,7 +124,7 @@ class RunFolder:
             if not self.begun:
                 raise RunFolderError(f"{self.path} holds no run to resume: no config.yaml in it")
             old = dict(walk(self.config()))  # with the defaults of fields newer than the run
-            differing = [f"{name}: {value}" for name, value in walk(config) if old[name] != value]
+            differing = [f"{name}: {value}" for name, value in walk(config) if not _goes_on(name, old[name], value)]
             if differing:
                 raise RunFolderError(f"{self.path} was run with another config, differing in {differing[:1]}")
         elif self._is_used:
@@ -132,6 +137,12 @@ class RunFolder:
                 if Path(name).resolve().is_relative_to(self.path.resolve()):
                     why = f"holds what this run starts from, {name}"
                     raise RunFolderError(f"{self.path} {why}, so it is not overwritten")
+
+    def reopen(self, config: Config) -> None:
+        """Go on with a run under a config that `check` allows; with another one the run is not finished any more."""
+        if writes_here() and self.config() != config:
+            self.summary_path.unlink(missing_ok=True)
+            save_text(self.config_path, to_yaml(config))
 
     def prepare(self, config: Config, *, resume: bool = False, overwrite: bool = False) -> None:
         """Make or check the folder, on the first host for all, or raise RunFolderError on every host."""

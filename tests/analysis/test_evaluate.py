@@ -10,17 +10,18 @@ from probes import Counting, Probe, Repeat
 from taic_jax.analysis.evaluate import evaluate, record
 from taic_jax.config import PPOConfig
 from taic_jax.rl import normalize, ppo
+from taic_jax.rl.agent import Agent
 
 END, EPISODES = 6, 100
 
 
-def make_agent() -> ppo.Agent:
+def make_agent() -> Agent:
     """Return an agent that draws options of two ticks from N(0, 1/e^2), whatever it sees."""
     executor = Repeat(2)
     policy = ppo.make_policy(executor, PPOConfig(hidden_sizes=(2,)))
     shapes = jax.eval_shape(lambda: policy.init(jax.random.key(0), 1, jnp.zeros(())))
     params = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape), shapes).replace(log_std=jnp.full(1, -1.0))
-    return ppo.Agent(executor, params, normalize.init((1,)), policy)
+    return Agent(executor, params, normalize.init((1,)), policy)
 
 
 AGENT = make_agent()

@@ -13,12 +13,14 @@ import numpy as np
 import pytest
 from probes import Counting, assert_trees_equal
 
-from taic_jax.artifacts.models import load_options, load_policy, save_options, save_policy
-from taic_jax.config import OptionsConfig, PPOConfig
+from taic_jax.artifacts.agents import load_policy, save_agents
+from taic_jax.artifacts.models import load_options, save_options
+from taic_jax.config import CollectConfig, Config, OptionsConfig, PPOConfig
+from taic_jax.networks import Policy
 from taic_jax.options.execution import IdentityExecutor
 from taic_jax.options.model import OptionModel, Scale, init_params, make_networks
 from taic_jax.rl import normalize
-from taic_jax.rl.ppo import Agent, Policy
+from taic_jax.rl.agent import Agent
 from taic_jax.runtime.checkpoint import ArtifactError
 from taic_jax.runtime.files import TEMPORARY
 
@@ -73,7 +75,9 @@ def saved(models, tmp_path_factory) -> Path:
     """Return a run's folder with the option models and the flat policies of two seeds."""
     run = tmp_path_factory.mktemp("runs") / "run"
     save_options(run / "options", models, Body(), CONFIG)
-    save_policy(run / "policy", jax.jit(jax.vmap(partial(make_agent, 4)))(jnp.arange(2)), Body(observation_size=4))
+    agents = jax.jit(jax.vmap(partial(make_agent, 4)))(jnp.arange(2))
+    config = Config(collect=CollectConfig(ppo=PPO))
+    save_agents(run / "agents" / "collect", agents, Body(observation_size=4), config, "collect")
     return run
 
 
@@ -176,7 +180,7 @@ SPOILS = [
 
 
 @pytest.mark.parametrize("spoil", SPOILS)
-@pytest.mark.parametrize("kind", ["options", "policy"])
+@pytest.mark.parametrize("kind", ["options", "agents/collect"])
 def test_what_is_no_whole_artifact_is_refused(saved, tmp_path, kind, spoil):
     run = tmp_path / "run"
     shutil.copytree(saved, run)
@@ -215,7 +219,9 @@ def test_a_policy_acts_on_the_body_as_it_did_whatever_else_is_observed(saved, si
 
 def test_policies_of_other_layers_or_bodies_are_refused(saved):
     message = refusal(load_policy, saved, Body(), PPOConfig(hidden_sizes=(4,)))
-    assert "policy/description.json: hidden_sizes: expected [4], " in message and message.endswith("got [4, 3]")
+    assert "collect/description.json: hidden_sizes: expected [4], " in message and message.endswith("got [4, 3]")
     message = refusal(load_policy, saved, Body(body="hiro"), PPO)
-    assert "policy/description.json: proprioception: expected 'hiro'" in message
-    assert f"{saved / 'options' / 'policy'}: expected a run" in refusal(load_policy, saved / "options", Body(), PPO)
+    assert "collect/description.json: proprioception: expected 'hiro'" in message
+    assert f"{saved / 'options' / 'agents' / 'collect'}: expected a run" in refusal(
+        load_policy, saved / "options", Body(), PPO
+    )

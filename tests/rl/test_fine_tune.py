@@ -159,12 +159,12 @@ def test_a_run_fine_tunes_in_turns_and_goes_on_where_it_stopped(tmp_path, monkey
         train__baselines=(),
     )
     with tiny_steps():
-        whole = run_pipeline(config, tmp_path / "whole")
+        whole = run_pipeline(config, tmp_path / "whole").summary
         die(monkeypatch, Checkpoints, "save", 3 + 2 + 2)  # after collect's and learn's, in the last step of train
         with pytest.raises(KilledError):
             run_pipeline(config, tmp_path / "torn")
         monkeypatch.undo()
-        resumed = run_pipeline(config, tmp_path / "torn", resume=True)
+        resumed = run_pipeline(config, tmp_path / "torn", resume=True).summary
     assert whole["ticks"] == 2 * (3 + 4) * 16
     assert whole["methods"] == resumed["methods"]
     assert_same_arrays(*(last_state(tmp_path / name, "train") for name in ("whole", "torn")))

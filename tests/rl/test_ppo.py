@@ -18,6 +18,7 @@ from taic_jax.networks import Policy, PolicyParams
 from taic_jax.nonfinite import QUANTITIES
 from taic_jax.options.execution import IdentityExecutor
 from taic_jax.rl import normalize, ppo, update
+from taic_jax.rl.agent import Agent
 from taic_jax.rl.returns import Judgement, semi_markov_advantages
 from taic_jax.rl.rollout import Rollout
 from taic_jax.types import as_arrays
@@ -70,7 +71,7 @@ def test_options_are_drawn_from_the_policy():
     policy, rng = Policy(2, (3,)), np.random.default_rng(0)
     shapes = jax.eval_shape(lambda: policy.init(jax.random.key(0), 1, jnp.zeros(())))
     params = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=leaf.shape), jnp.float32), shapes)
-    agent = ppo.Agent(EXECUTOR, params, normalize.init((1,)), policy)
+    agent = Agent(EXECUTOR, params, normalize.init((1,)), policy)
     obs, noise = (jnp.asarray(rng.normal(size=(4, size)), jnp.float32) for size in (1, 2))
     mean, std = np.asarray(policy.distribution(params, obs).mean()), np.exp(np.asarray(params.log_std))
     for exploration in (1.0, 0.5, 0.0):
@@ -229,7 +230,7 @@ def test_solves_the_probes():
     assert action[5, 0] < -0.5 and action[6, 0] > 0.5
 
 
-def train(config: PPOConfig, key: jax.Array) -> tuple[ppo.Agent, dict[str, jax.Array]]:
+def train(config: PPOConfig, key: jax.Array) -> tuple[Agent, dict[str, jax.Array]]:
     return ppo.train(config, ENV, EXECUTOR, key, 2 * config.num_envs * config.rollout_length)
 
 

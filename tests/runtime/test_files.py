@@ -42,7 +42,7 @@ FULL = {
     "checkpoint": (Checkpoints, "save", 3, "checkpoints/collect/[23]"),
     "metrics": (RunLogger, "log", 5, "metrics.jsonl"),
     "events": (RunLogger, "_write_events", 3, "tensorboard"),
-    "artifact": (pipeline, "save_policy", 1, "policy"),
+    "artifact": (pipeline, "save_agents", 1, "agents/collect/arrays.safetensors"),
     "summary": (pipeline, "as_summary", 1, "summary.json"),
 }
 

@@ -12,7 +12,7 @@ from taic_jax.artifacts.models import load_options
 from taic_jax.config import COLLECT, replace
 from taic_jax.envs.base import Env
 from taic_jax.nonfinite import FINITE, QUANTITIES
-from taic_jax.pipeline import make_envs, select_windows
+from taic_jax.pipeline import make_envs, select_windows, take_over
 from taic_jax.runtime.checkpoint import ArtifactError, load_tree
 from taic_jax.runtime.driver import Run
 from taic_jax.runtime.files import read_description
@@ -58,8 +58,10 @@ def _stage(run: Run, env: Env, source: Env, stage: str) -> tuple[Any, Any, tuple
     if stage == "learn":
         states = jax.eval_shape(partial(init_learning, source), config.options, keys)
         return learn_rows, states, (config.options, select_windows(run, source))
-    folder = Path(config.options.source or run.folder.path)
-    model = load_options(folder, env, config.options, len(keys)) if stage == "train" else None
+    model = None
+    if stage == "train":
+        model = take_over(replace(run.folder.config(), "seeds", len(keys)), env, source).model
+        model = load_options(run.folder.path, env, config.options, len(keys)) if model is None else model
     make = partial(make_trainer, stage, source if stage == COLLECT else env)
     states = jax.eval_shape(partial(init_rows, make), (config, model), keys)
     return partial(step_rows, make), states, ((config, model),)

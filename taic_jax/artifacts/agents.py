@@ -1,0 +1,152 @@
+"""Trained agents [K] of a method as an artifact: `arrays.safetensors`, and `description.json` with the run's config.
+
+Both files are data: reading them executes nothing.
+"""
+
+import dataclasses
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import safetensors.numpy
+from safetensors import SafetensorError
+
+from taic_jax import __version__
+from taic_jax.artifacts.models import Body, check_description, describe, empty_model, read_body, rows_like, structure
+from taic_jax.config import COLLECT, TAIC, Config, ConfigError, PPOConfig
+from taic_jax.config_io import from_mapping
+from taic_jax.envs.base import Env
+from taic_jax.networks import Policy, PolicyParams
+from taic_jax.options.execution import Executor, IdentityExecutor, make_executor
+from taic_jax.options.model import OptionModel
+from taic_jax.rl import normalize
+from taic_jax.rl.agent import Agent
+from taic_jax.runtime.checkpoint import ArtifactError, checksums, fit_tree, plain_arrays
+from taic_jax.runtime.files import DESCRIPTION, atomic_file, read_description, save_json, writes_here, writing
+
+AGENTS, ARRAYS = "agents", "arrays.safetensors"
+FORMAT = 1  # of the two files; a later one is refused
+
+
+Weights = tuple[PolicyParams, normalize.Statistics]
+"""A policy without its executor: its parameters, and the statistics that normalise its observations."""
+
+
+class Description(NamedTuple):
+    """Agents without their arrays: all that is needed to act with them."""
+
+    body: Body
+    observation_size: int
+    method: str
+    seeds: int
+    config: Config
+
+
+def save_agents(folder: Path, agents: Agent, env: Env, config: Config, method: str) -> None:
+    """Save the agents [K] of a method as the artifact `folder`, or raise SaveError."""
+    arrays = plain_arrays(agents)
+    if writes_here():
+        with writing(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+            (folder / DESCRIPTION).unlink(missing_ok=True)  # until the arrays that it describes are whole
+    with atomic_file(folder / ARRAYS) as file:
+        file.write(safetensors.numpy.save(arrays))
+    description = {
+        "format": FORMAT,
+        "taic_jax": __version__,
+        "method": method,
+        **describe(env),
+        "observation_size": env.observation_size,
+        "hidden_sizes": list(agents.policy.hidden_sizes),
+        **(structure(config.options) if method == TAIC else {}),
+        "seeds": len(agents.params.log_std),
+        "crc32": checksums(arrays),
+        "config": dataclasses.asdict(config),
+    }
+    save_json(folder / DESCRIPTION, description)
+
+
+def read_agents(folder: Path) -> Description:
+    """Read the description of agents, or raise ArtifactError."""
+    description = read_description(folder)
+    if description is None:
+        raise ArtifactError(f"{folder}: expected a run that got this far, or its agents; got none")
+    if not isinstance(version := description.get("format"), int):
+        raise ArtifactError(f"{folder / DESCRIPTION}: expected the description of an artifact, got another file")
+    if version > FORMAT:
+        writer = f"taic_jax {description.get('taic_jax')} wrote format {version}"
+        raise ArtifactError(f"{folder}: {writer}, this is taic_jax {__version__}, which reads formats to {FORMAT}")
+    try:
+        size, method, seeds = (description[name] for name in ("observation_size", "method", "seeds"))
+        return Description(read_body(folder), size, method, seeds, from_mapping(description["config"]))
+    except (KeyError, ConfigError) as error:
+        raise ArtifactError(f"{folder / DESCRIPTION}: expected the description of agents: {error}") from None
+
+
+def load_agents(folder: Path) -> Agent:
+    """Load agents [K], or raise ArtifactError if their files are damaged or of another structure."""
+    description, path = read_agents(folder), folder / ARRAYS
+    stored = read_description(folder) or {}
+    try:
+        arrays = safetensors.numpy.load_file(path)
+        if checksums(arrays) != stored.get("crc32"):
+            raise SafetensorError
+    except (OSError, SafetensorError):
+        raise ArtifactError(f"{path}: expected an artifact, got files of another kind or damaged ones") from None
+    like = rows_like(description.seeds, lambda: _empty_agent(description))
+    return fit_tree(path, arrays, str(stored.get("taic_jax")), like)
+
+
+def _empty_agent(description: Description) -> Agent:
+    """Return an agent of this structure, whose numbers are not meaningful."""
+    body, config = description.body, description.config
+    if description.method == TAIC:
+        executor: Executor = make_executor(config.options, empty_model(body, config.options))
+        ppo = config.train.ppo
+    else:
+        hold = config.options.length if description.method == "repeat" else 1
+        executor, ppo = IdentityExecutor(body.action_size, hold), config.collect.ppo
+    policy, size = Policy(executor.option_size, tuple(ppo.hidden_sizes)), description.observation_size
+    return Agent(executor, policy.init(jax.random.key(0), size, 0.0), normalize.init((size,)), policy)
+
+
+def load_taic(source: Path, env: Env, config: Config) -> tuple[OptionModel, Weights]:
+    """Load a run's options, fine-tuned if it did so, and its policies over them, for the seeds of another config.
+
+    Seed k takes the k-th, modulo their number. Raise ArtifactError for another body, observation or structure.
+    """
+    folder = source / AGENTS / TAIC
+    fields = {"observation_size": env.observation_size, "hidden_sizes": list(config.train.ppo.hidden_sizes)}
+    check_description(folder, "policy over options", env, fields | structure(config.options))
+    agents: Any = load_agents(folder)
+    rows = jnp.arange(config.seeds) % len(agents.params.log_std)
+    return jax.tree.map(lambda x: x[rows], (agents.executor.model, (agents.params, agents.obs_statistics)))
+
+
+def load_policy(source: Path, env: Env, config: PPOConfig, seeds: int) -> Weights:
+    """Load the collector's policies [seeds] of a run on another task of the same body, or raise ArtifactError.
+
+    Input weights of the proprioceptive slice are copied; other observations of `env` get zeros and new statistics.
+    """
+    folder = source / AGENTS / COLLECT
+    check_description(folder, "flat policy", env, {"hidden_sizes": list(config.hidden_sizes)})
+    agents = load_agents(folder)
+    rows = jnp.arange(seeds) % len(agents.params.log_std)
+    params, statistics = jax.tree.map(lambda x: x[rows], (agents.params, agents.obs_statistics))
+    fit = jax.vmap(lambda p, s: _fit(p, s, env.proprioceptive_size, env.observation_size))
+    return fit(params, statistics)
+
+
+def _fit(
+    params: PolicyParams, statistics: normalize.Statistics, shared: int, size: int
+) -> tuple[PolicyParams, normalize.Statistics]:
+    """Copy the weights of the first `shared` inputs of a policy into one of `size` inputs."""
+
+    def widen(layers: dict) -> dict:
+        first = layers["params"]["Dense_0"]
+        kernel = jnp.zeros((size, first["kernel"].shape[1])).at[:shared].set(first["kernel"][:shared])
+        return {"params": {**layers["params"], "Dense_0": {**first, "kernel": kernel}}}
+
+    params = params.replace(actor=widen(params.actor), critic=widen(params.critic))
+    return params, normalize.carry_over(statistics, shared, size)

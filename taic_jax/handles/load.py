@@ -1,0 +1,86 @@
+"""A finished run, or an artifact, as an object: its config, environment, option models and agents."""
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from taic_jax.artifacts.agents import AGENTS, load_agents, read_agents
+from taic_jax.artifacts.models import STRUCTURE, load_options, read_body
+from taic_jax.config import TAIC, CollectConfig, Config
+from taic_jax.config_io import from_mapping
+from taic_jax.envs.base import Env
+from taic_jax.options.model import OptionModel
+from taic_jax.pipeline import make_envs
+from taic_jax.rl.agent import Agent
+from taic_jax.runtime.checkpoint import ArtifactError
+from taic_jax.runtime.files import read_description
+from taic_jax.runtime.run_folder import RunFolder
+from taic_jax.types import Seeds
+
+
+@dataclass(frozen=True)
+class Handle:
+    """All that a run leaves to act with; `agents` are those of each method: `taic`, the baselines, and `collect`."""
+
+    config: Config
+    agents: Mapping[str, Seeds[Agent]]
+    models: Seeds[OptionModel] | None = None
+
+    @property
+    def options(self) -> Seeds[OptionModel]:
+        """The option models that `taic` acts with, fine-tuned if the run did so; ArtifactError for a baseline alone."""
+        if self.models is None:
+            raise ArtifactError(f"expected options, got the agents of {', '.join(self.agents)} alone")
+        return self.models
+
+    @cached_property
+    def env(self) -> Env:
+        """The task."""
+        with jax.ensure_compile_time_eval():  # its first use may be in a function that is traced
+            return make_envs(dataclasses.replace(self.config, collect=CollectConfig()))[0]
+
+
+def load(source: str | Path) -> Handle:
+    """Load a finished run by its folder, or one of its artifacts, `options` or `agents/METHOD`.
+
+    Raises:
+      ArtifactError: there is neither, the run was not finished, or its files are damaged or of a later version.
+      ConfigError: the config of the run is of another version.
+    """
+    path = Path(source)
+    run = RunFolder(path)
+    if run.begun:
+        if not run.finished:
+            raise ArtifactError(f"{path}: expected a finished run, got one that --resume goes on with")
+        return _load_run(path, run.config())
+    description = read_description(path)
+    if description is None:
+        raise ArtifactError(f"{path}: expected the folder of a run, or of an artifact of one; got neither")
+    if "method" in description:
+        return _handle(read_agents(path).config, {description["method"]: Seeds(load_agents(path))})
+    return _load_model(path, description)
+
+
+def _load_run(path: Path, config: Config) -> Handle:
+    folders = sorted(folder for folder in (path / AGENTS).glob("*") if folder.is_dir())
+    agents = {folder.name: Seeds(load_agents(folder)) for folder in folders}
+    if TAIC not in agents:
+        raise ArtifactError(f"{path / AGENTS}: expected the agents that a run of this version leaves, got none")
+    return _handle(config, agents)
+
+
+def _handle(config: Config, agents: dict[str, Seeds[Agent]]) -> Handle:
+    executor: Any = agents[TAIC].rows.executor if TAIC in agents else None
+    return Handle(config, agents, executor and Seeds(executor.model))
+
+
+def _load_model(path: Path, description: dict[str, Any]) -> Handle:
+    body = read_body(path)
+    structure = {name: description.get(f"options.{name}") for name in STRUCTURE}
+    config = from_mapping({"env": {"name": body.name}, "options": structure})
+    return Handle(config, {}, Seeds(load_options(path, body, config.options, description["seeds"])))

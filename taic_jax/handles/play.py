@@ -1,0 +1,111 @@
+"""Film the agents of a finished run: `taic play RUN`; see docs/use.md. Nothing is trained or changed."""
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+import tyro
+from PIL import Image, ImageDraw
+
+from taic_jax.config import METHOD_LABELS, TAIC, impossible
+from taic_jax.handles import command
+from taic_jax.handles.command import answer, methods_of
+
+if TYPE_CHECKING:
+    from taic_jax.handles.load import Handle
+
+PROGRAM = "taic play"
+WINDOW = 80  # ticks in the strip of options
+MARK = (255, 255, 255)
+
+
+@dataclass(frozen=True)
+class Command(command.Command):
+    """Film one episode of an agent, with its running option; of several methods, side by side, by default of taic."""
+
+    seed: int = 0
+    """Seed of the run whose agent acts, counted from 0."""
+    ticks: int = 0
+    """Ticks to film; 0 films an episode."""
+    out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("play.webp")
+    """Film to write: a name that ends in .webp, .gif or, with the extra video, .mp4."""
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit code: 0, or 2 for a mistake or a machine that cannot draw."""
+    return answer(args, PROGRAM, Command, execute)
+
+
+def execute(command: Command, handle: "Handle") -> None:
+    """Film, write the file and print its path and the returns."""
+    methods = methods_of(command, handle, (TAIC,))
+    last = len(handle.agents[methods[0]]) - 1
+    if not 0 <= command.seed <= last:
+        raise impossible("--seed", command.seed, f"0 to {last}", min(max(command.seed, 0), last))
+    if command.ticks < 0:
+        raise impossible("--ticks", command.ticks, "at least 0", 0)
+    from taic_jax.envs.rendering import check_film, write_film
+    from taic_jax.runtime.files import atomic_file
+
+    check_film(command.out)
+    films = [film(handle, name, command) for name in methods]
+    frames = np.concatenate([np.pad(x, ((0, max(map(len, films)) - len(x)), *[(0, 0)] * 3), "edge") for x in films], 2)
+    with atomic_file(command.out) as file:
+        write_film(command.out, file, frames, handle.env.dt)
+    print(command.out)
+
+
+def film(handle: "Handle", method: str, command: Command) -> np.ndarray:
+    """Return the frames [T, H, W, 3] of one episode, or of `--ticks` ticks, and print the return."""
+    import jax
+
+    from taic_jax.analysis.evaluate import trace
+
+    env, agent = handle.env, handle.agents[method][command.seed]
+    length, key = command.ticks or env.episode_length, jax.random.key(command.key)
+
+    def run(agent: Any, key: Any) -> Any:
+        return trace(env, agent, key, length, float(command.explore))
+
+    ticks = jax.device_get(jax.jit(run)(agent, key))
+    done = ticks.terminated | ticks.truncated
+    end = int(np.argmax(done)) + 1 if done.any() and not command.ticks else length
+    ticks = jax.tree.map(lambda x: x[:end], ticks)
+    count = int(ticks.decision.sum())
+    label = METHOD_LABELS.get(method, method)
+    print(f"{label}: return {ticks.reward.sum():,.1f} in {end} ticks and {count} decisions")
+    latest = np.maximum.accumulate(np.where(ticks.decision, np.arange(end), 0))
+    marks = ticks.decision if agent.executor.length > 1 else np.zeros(end, bool)  # flat PPO decides at every tick
+    return with_label(with_options(env.render(ticks.extras), ticks.option[latest], marks), label)
+
+
+def with_label(frames: np.ndarray, text: str) -> np.ndarray:
+    """Write a text into the corner of each frame."""
+    label = Image.new("L", (frames.shape[2], 16))
+    ImageDraw.Draw(label).text((6, 3), text, fill=255)
+    frames[:, :16] = np.maximum(frames[:, :16], np.asarray(label)[..., None])
+    return frames
+
+
+def with_options(frames: np.ndarray, options: np.ndarray, decision: np.ndarray) -> np.ndarray:
+    """Draw the options [T, D] of the last ticks below each frame, as colours, with a mark at each decision."""
+    count, height, width, _ = frames.shape
+    colours = np.zeros((count, 3))
+    shown = min(3, options.shape[1])
+    colours[:, :shown] = np.tanh(options[:, :shown] / 2)
+    colours = (127.5 + 100 * colours).astype(np.uint8)
+    cell, strip = max(width // WINDOW, 1), max(height // 24, 4)
+    for t, frame in enumerate(frames):
+        for age in range(min(WINDOW, t + 1)):
+            right = width - age * cell
+            frame[-strip:, max(right - cell, 0) : right] = colours[t - age]
+            if decision[t - age]:
+                frame[-strip:, max(right - cell, 0)] = MARK
+    return frames
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,127 @@
+"""The command `taic` on a finished run: evaluations and films that agree with it, and every mistake in one line."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from PIL import Image
+from tiny_runs import CONFIG, files_of, with_fields
+
+import taic_jax as taic
+from taic_jax.__main__ import COMMANDS, main
+from taic_jax.config_io import preset_names
+from taic_jax.handles.play import MARK, with_label, with_options
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("run") / "run"
+    taic.run_pipeline(with_fields(CONFIG, evaluate__video_ticks=0), folder, quiet=True)
+    return folder
+
+
+@pytest.mark.parametrize("explore", [False, True])
+def test_evaluate_measures_every_seed_as_the_function_does(run, tmp_path, monkeypatch, capsys, explore):
+    monkeypatch.setenv("COLUMNS", "160")
+    before, out = files_of(run), tmp_path / "evaluation.json"
+    args = ["--episodes", "3", "--key", "5", "--out", str(out), *["--explore"] * explore]
+    assert main(["evaluate", str(run), *args]) == 0
+    table, told = capsys.readouterr().out, json.loads(out.read_text())
+    assert "options (TAIC)" in table and "flat PPO" in table and "nav2d, 3 episodes a seed" in table
+    assert "final/distance_to_goal" in table and "ticks of an option" in table
+    assert (told["env"], told["episodes"], told["key"], told["explore"]) == ("nav2d", 3, 5, explore)
+    handle, keys = taic.load(run), jax.random.split(jax.random.key(5), 2)
+    for method in ("taic", "flat"):
+        direct = [taic.evaluate(handle.env, handle.agents[method][k], keys[k], 3, float(explore)) for k in range(2)]
+        for name in ("return", "final/distance_to_goal"):
+            expected = [float(values[name]) for values in direct]
+            np.testing.assert_allclose(told["methods"][method][name]["per_seed"], expected, rtol=1e-4)
+    assert files_of(run) == before
+
+
+def test_play_films_an_episode_of_methods_side_by_side(run, tmp_path, capsys):
+    before, film = files_of(run), tmp_path / "film.gif"
+    assert main(["play", str(run), "--methods", "taic", "flat", "--seed", "1", "--ticks", "7", "--out", str(film)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("options (TAIC): return ") and lines[0].endswith("in 7 ticks and 4 decisions")
+    assert lines[1].startswith("flat PPO: return ") and lines[1].endswith("in 7 ticks and 7 decisions")
+    assert lines[2] == str(film)
+    env = taic.make_env("nav2d")
+    with Image.open(film) as image:
+        single = env.render(jax.tree.map(lambda x: x[None], env.reset(jax.random.key(0)).physics))
+        assert image.size == (2 * single.shape[2], single.shape[1]) and image.n_frames > 1
+    assert files_of(run) == before
+
+
+def test_the_label_covers_the_top_alone():
+    frames = with_label(np.zeros((2, 48, 160, 3), np.uint8), "flat PPO")
+    assert frames[:, :16].max() == 255 and not frames[:, 16:].any() and (frames[0] == frames[1]).all()
+
+
+def test_the_strip_shows_the_options_of_past_ticks_and_marks_decisions():
+    options = np.array([[9.0, -9, 0], [9, -9, 0], [-9, 9, 0]])
+    frames = with_options(np.zeros((3, 48, 160, 3), np.uint8), options, np.array([True, False, True]))
+    first, second = (227, 27, 127), (27, 227, 127)
+    assert tuple(frames[2, -1, 159]) == second and tuple(frames[2, -1, 158]) == MARK  # the newest tick is at the right
+    assert tuple(frames[2, -1, 157]) == tuple(frames[2, -1, 156]) == first  # it was a tick of the option before
+    assert tuple(frames[2, -1, 155]) == first and tuple(frames[2, -1, 154]) == MARK
+    assert not frames[2, -1, :154].any() and not frames[:, :40].any()
+
+
+MISTAKES = {
+    "evaluate": "RUN: expected the folder of a finished run first",
+    "evaluate nowhere": "nowhere: expected the folder of a run, or of an artifact of one",
+    "evaluate RUN --methods flta": "--methods: expected some of collect, flat, taic, got flta; the nearest is flat",
+    "evaluate RUN --episodes 0": "--episodes: expected at least 1, got 0; the nearest valid value is 1",
+    "evaluate RUN --episods 3": "unknown option --episods; the nearest is --episodes",
+    "evaluate RUN --env.name nav3d": "unknown environment 'nav3d': did you mean 'nav2d'?",
+    "evaluate RUN --env.name nav2d_random": "as flat was trained for, got nav2d_random with 4 and 2",
+    "play RUN --seed 2": "--seed: expected 0 to 1, got 2; the nearest valid value is 1",
+    "play RUN --ticks -1": "--ticks: expected at least 0, got -1",
+    "play RUN --out film.avi": "film.avi: expected a name that ends in one of .webp, .gif, .mp4",
+    "play RUN/options": "RUN: expected agents",
+    "evalute RUN": "unknown command evalute; the nearest is evaluate",
+    "presets now": "taic presets: expected no arguments, got now",
+}
+
+
+@pytest.mark.parametrize("line", MISTAKES)
+def test_a_mistake_is_one_line_and_leaves_nothing(run, tmp_path, monkeypatch, capsys, line):
+    monkeypatch.chdir(tmp_path)
+    before = files_of(run)
+    assert main([word.replace("RUN", str(run)) for word in line.split()]) == 2
+    (message,) = capsys.readouterr().err.splitlines()
+    assert message.startswith("taic_jax: error: ") and MISTAKES[line] in message.replace(str(run), "RUN")
+    assert files_of(run) == before and not any(tmp_path.iterdir())
+
+
+def test_the_help_lists_every_command_and_each_has_its_own(capsys):
+    assert main([]) == main(["--help"]) == 0
+    out = capsys.readouterr().out
+    assert all(f"  {name} " in out for name in COMMANDS)
+    for name in set(COMMANDS) - {"presets"}:
+        with pytest.raises(SystemExit) as stop:
+            main([name, "--help"])
+        assert stop.value.code == 0 and "--" in capsys.readouterr().out
+
+
+def test_the_help_and_the_version_answer_without_jax():
+    code = (
+        "import sys\nfrom taic_jax.__main__ import main\nmain(['--version'])\nmain([])\nassert 'jax' not in sys.modules"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0 and done.stdout.startswith(f"taic_jax {taic.__version__}\nusage: taic COMMAND")
+
+
+def test_presets_lists_each_with_its_task_and_its_purpose(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    assert main(["presets"]) == 0
+    lines = [line.split(maxsplit=2) for line in capsys.readouterr().out.splitlines() if line.strip()]
+    assert {line[0] for line in lines[2:]} == set(preset_names())
+    assert ["transfer_ant_maze", "ant_maze", "Ant's options in the maze"] in [
+        [x.strip() for x in line] for line in lines
+    ]
