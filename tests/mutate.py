@@ -26,7 +26,9 @@ TESTS = {
     "termination": "options/test_termination.py options/test_algorithm_1.py", "losses": "options/test_termination.py",
     "learning": "rl/test_learning.py options/test_losses.py options/test_algorithm_1.py",
     "ant_tasks": "envs/test_arenas.py", "evaluate": "test_trainer.py",
-    "summary": "test_dry_run.py test_transfer.py",
+    "summary": "test_dry_run.py test_transfer.py", "agent": "handles/test_load.py",
+    "agents": "handles/test_load.py artifacts/test_artifacts.py", "play": "handles/test_commands.py",
+    "assess": "handles/test_commands.py", "command": "handles/test_commands.py",
 }  # fmt: skip
 """Tests of a module besides `test_MODULE*.py`."""
 OPERATORS = {ast.Add: ast.Sub, ast.Mult: ast.Div, ast.BitAnd: ast.BitOr, ast.LShift: ast.RShift, ast.And: ast.Or,
