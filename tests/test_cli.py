@@ -262,19 +262,6 @@ def test_help_shows_every_field_with_its_help(capsys):
         assert part in out
 
 
-def test_the_short_help_shows_the_options_of_the_command_and_the_common_fields(capsys):
-    with pytest.raises(SystemExit) as stop:
-        main(["half_cheetah", "--help"])
-    lines = capsys.readouterr().out.splitlines()
-    assert stop.value.code == 0 and lines[0] == f"usage: {PROGRAM} [CONFIG] [OPTIONS]" and len(lines) < 50
-    assert f"{PROGRAM} --help-all shows every field; presets: ant, " in lines[-1]
-    shown = {line.split()[0]: " ".join(line.split()[1:]) for line in lines if line.startswith("  --")}
-    assert shown["--train.ppo.gamma"] == "Discount per tick (0.99)" and shown["--seeds"].endswith("(1)")
-    assert shown["--resume"] == "Continue the run in --run-dir from its last checkpoint"
-    assert {f"--{name}".replace("_", "-") for name in command_line.COMMON_FIELDS} <= set(shown)
-    assert "--replay" in shown and "--config" not in shown and max(map(len, lines[4:-1])) <= 140
-
-
 def test_every_field_has_help():
     for cls in CONFIG_CLASSES:
         lines = inspect.getsource(cls).splitlines()
