@@ -4,6 +4,7 @@ import importlib
 import os
 import sys
 import tempfile
+import warnings
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -79,7 +80,9 @@ def write_film(path: Path, file: BinaryIO, frames: Frames, dt: float) -> None:
         film = Path(folder) / "film.mp4"
         size = frames.shape[2], frames.shape[1]
         writer = _ffmpeg().write_frames(str(film), size, fps=1 / (dt * every), macro_block_size=2)
-        writer.send(None)
+        with warnings.catch_warnings():  # JAX warns of a fork; ffmpeg is executed in it at once
+            warnings.simplefilter("ignore", RuntimeWarning)
+            writer.send(None)
         for frame in frames[::every]:
             writer.send(np.ascontiguousarray(frame))
         writer.close()

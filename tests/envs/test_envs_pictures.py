@@ -148,3 +148,20 @@ def test_the_module_runs_and_its_help_shows_every_argument():
     assert done.returncode == 0 and done.stderr == ""
     for field in dataclasses.fields(pictures.Arguments):
         assert "--" + field.name.replace("_", "-") in done.stdout
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # imageio-ffmpeg leaves a pipe open
+def test_an_mp4_plays_in_real_time(tmp_path):
+    ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    film, frames = tmp_path / "film.mp4", np.zeros((30, 32, 48, 3), np.uint8)
+    with film.open("wb") as file:
+        rendering.write_film(film, file, frames, dt=0.02)
+    reader = ffmpeg.read_frames(str(film))
+    assert (about := next(reader))["size"] == (48, 32) and about["fps"] == 25.0
+    assert len(list(reader)) == 15
+
+
+@pytest.mark.parametrize("name", ["film.avi", "film"])
+def test_a_film_of_another_format_is_refused(tmp_path, name):
+    with pytest.raises(RenderingError, match=r"expected a name that ends in one of \.webp, \.gif, \.mp4"):
+        rendering.check_film(tmp_path / name)
