@@ -83,10 +83,12 @@ def film(handle: "Handle", method: str, command: Command) -> np.ndarray:
 
 
 def with_label(frames: np.ndarray, text: str) -> np.ndarray:
-    """Write a text into the corner of each frame."""
-    label = Image.new("L", (frames.shape[2], 16))
-    ImageDraw.Draw(label).text((6, 3), text, fill=255)
-    frames[:, :16] = np.maximum(frames[:, :16], np.asarray(label)[..., None])
+    """Write a text into the corner of each frame, white on a darkened ground."""
+    image = Image.new("L", (frames.shape[2], 16))
+    draw = ImageDraw.Draw(image)
+    draw.text((6, 3), text, fill=255)
+    corner = frames[:, :16, : int(draw.textlength(text)) + 12]
+    corner[:] = np.maximum(corner // 4, np.asarray(image)[:, : corner.shape[2], None])
     return frames
 
 

@@ -59,9 +59,12 @@ def test_play_films_an_episode_of_methods_side_by_side(run, tmp_path, capsys):
     assert files_of(run) == before
 
 
-def test_the_label_covers_the_top_alone():
-    frames = with_label(np.zeros((2, 48, 160, 3), np.uint8), "flat PPO")
-    assert frames[:, :16].max() > 200 and not frames[:, 16:].any() and (frames[0] == frames[1]).all()
+@pytest.mark.parametrize("ground", [0, 250])
+def test_the_label_is_read_on_any_ground_and_covers_the_corner_alone(ground):
+    frames = with_label(np.full((2, 48, 160, 3), ground, np.uint8), "flat PPO")
+    corner = frames[:, :16, :40]
+    assert corner.max() > 200 and np.median(corner) <= ground / 4 and (frames[0] == frames[1]).all()
+    assert (frames[:, 16:] == ground).all() and (frames[:, :, 90:] == ground).all()
 
 
 def test_the_strip_shows_the_options_of_past_ticks_and_marks_decisions():
