@@ -13,7 +13,16 @@ import safetensors.numpy
 from safetensors import SafetensorError
 
 from taic_jax import __version__
-from taic_jax.artifacts.models import Body, check_description, describe, empty_model, read_body, rows_like, structure
+from taic_jax.artifacts.models import (
+    Body,
+    check_description,
+    describe,
+    empty_model,
+    for_seeds,
+    read_body,
+    rows_like,
+    structure,
+)
 from taic_jax.config import COLLECT, TAIC, Config, ConfigError, PPOConfig
 from taic_jax.config_io import from_mapping
 from taic_jax.envs.base import Env
@@ -28,7 +37,6 @@ from taic_jax.runtime.files import DESCRIPTION, atomic_file, read_description, s
 AGENTS, ARRAYS = "agents", "arrays.safetensors"
 FORMAT = 1  # of the two files; a later one is refused
 
-
 Weights = tuple[PolicyParams, normalize.Statistics]
 """A policy without its executor: its parameters, and the statistics that normalise its observations."""
 
@@ -41,6 +49,8 @@ class Description(NamedTuple):
     method: str
     seeds: int
     config: Config
+    writer: str
+    checksums: dict[str, int]
 
 
 def save_agents(folder: Path, agents: Agent, env: Env, config: Config, method: str) -> None:
@@ -79,7 +89,8 @@ def read_agents(folder: Path) -> Description:
         raise ArtifactError(f"{folder}: {writer}, this is taic_jax {__version__}, which reads formats to {FORMAT}")
     try:
         size, method, seeds = (description[name] for name in ("observation_size", "method", "seeds"))
-        return Description(read_body(folder), size, method, seeds, from_mapping(description["config"]))
+        config, writer, sums = from_mapping(description["config"]), description["taic_jax"], description["crc32"]
+        return Description(read_body(folder), size, method, seeds, config, writer, sums)
     except (KeyError, ConfigError) as error:
         raise ArtifactError(f"{folder / DESCRIPTION}: expected the description of agents: {error}") from None
 
@@ -87,15 +98,14 @@ def read_agents(folder: Path) -> Description:
 def load_agents(folder: Path) -> Agent:
     """Load agents [K], or raise ArtifactError if their files are damaged or of another structure."""
     description, path = read_agents(folder), folder / ARRAYS
-    stored = read_description(folder) or {}
     try:
         arrays = safetensors.numpy.load_file(path)
-        if checksums(arrays) != stored.get("crc32"):
+        if checksums(arrays) != description.checksums:
             raise SafetensorError
     except (OSError, SafetensorError):
         raise ArtifactError(f"{path}: expected an artifact, got files of another kind or damaged ones") from None
     like = rows_like(description.seeds, lambda: _empty_agent(description))
-    return fit_tree(path, arrays, str(stored.get("taic_jax")), like)
+    return fit_tree(path, arrays, description.writer, like)
 
 
 def _empty_agent(description: Description) -> Agent:
@@ -120,8 +130,7 @@ def load_taic(source: Path, env: Env, config: Config) -> tuple[OptionModel, Weig
     fields = {"observation_size": env.observation_size, "hidden_sizes": list(config.train.ppo.hidden_sizes)}
     check_description(folder, "policy over options", env, fields | structure(config.options))
     agents: Any = load_agents(folder)
-    rows = jnp.arange(config.seeds) % len(agents.params.log_std)
-    return jax.tree.map(lambda x: x[rows], (agents.executor.model, (agents.params, agents.obs_statistics)))
+    return for_seeds(config.seeds, (agents.executor.model, (agents.params, agents.obs_statistics)))
 
 
 def load_policy(source: Path, env: Env, config: PPOConfig, seeds: int) -> Weights:
@@ -132,15 +141,12 @@ def load_policy(source: Path, env: Env, config: PPOConfig, seeds: int) -> Weight
     folder = source / AGENTS / COLLECT
     check_description(folder, "flat policy", env, {"hidden_sizes": list(config.hidden_sizes)})
     agents = load_agents(folder)
-    rows = jnp.arange(seeds) % len(agents.params.log_std)
-    params, statistics = jax.tree.map(lambda x: x[rows], (agents.params, agents.obs_statistics))
+    params, statistics = for_seeds(seeds, (agents.params, agents.obs_statistics))
     fit = jax.vmap(lambda p, s: _fit(p, s, env.proprioceptive_size, env.observation_size))
     return fit(params, statistics)
 
 
-def _fit(
-    params: PolicyParams, statistics: normalize.Statistics, shared: int, size: int
-) -> tuple[PolicyParams, normalize.Statistics]:
+def _fit(params: PolicyParams, statistics: normalize.Statistics, shared: int, size: int) -> Weights:
     """Copy the weights of the first `shared` inputs of a policy into one of `size` inputs."""
 
     def widen(layers: dict) -> dict:

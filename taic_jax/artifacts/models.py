@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from taic_jax.config import OptionsConfig
 from taic_jax.envs.base import Env
 from taic_jax.options.model import OptionModel, Scale, init_params, make_networks
-from taic_jax.runtime.checkpoint import ArtifactError, load_tree, save_tree
+from taic_jax.runtime.checkpoint import ArtifactError, Tree, load_tree, save_tree
 from taic_jax.runtime.files import DESCRIPTION, read_description, save_json
 
 OPTIONS = "options"
@@ -74,9 +74,12 @@ def load_options(source: Path, env: Env | Body, config: OptionsConfig, seeds: in
     """Load option models [seeds] from a run or an artifact, or raise ArtifactError; seed k takes model k modulo K."""
     folder = source / OPTIONS if (source / OPTIONS).is_dir() else source
     description = check_description(folder, "option model", env, structure(config))
-    saved = description["seeds"]
-    like = rows_like(saved, partial(empty_model, env, config))
-    return jax.tree.map(lambda x: x[jnp.arange(seeds) % saved], load_tree(folder, like))
+    return for_seeds(seeds, load_tree(folder, rows_like(description["seeds"], partial(empty_model, env, config))))
+
+
+def for_seeds(seeds: int, rows: Tree) -> Tree:
+    """Return rows [seeds], of which the k-th is row k modulo their number."""
+    return jax.tree.map(lambda x: x[jnp.arange(seeds) % len(x)], rows)
 
 
 def empty_model(env: Env | Body, config: OptionsConfig) -> OptionModel:
