@@ -11,9 +11,9 @@ import jax
 import jax.numpy as jnp
 
 from taic_jax import trainer
-from taic_jax.artifacts.agents import AGENTS, Weights, load_policy, load_taic, save_agents
+from taic_jax.artifacts.agents import Weights, load_policy, load_taic, save_agents
 from taic_jax.artifacts.experience import EXPERIENCE, ExperienceStore, gather_experience, num_blocks
-from taic_jax.artifacts.models import OPTIONS, describe, load_options, save_options
+from taic_jax.artifacts.models import AGENTS, OPTIONS, describe, load_options, save_options
 from taic_jax.config import COLLECT, TAIC, Config, ConfigError, Shard, collector_is_baseline, impossible, needs_collect
 from taic_jax.envs import environment_options, make_env
 from taic_jax.envs.base import Env
@@ -161,13 +161,13 @@ def take_over(config: Config, env: Env, source: Env) -> Inherited:
             if name != COLLECT:
                 gather_experience(Path(name), source, 1)
         return Inherited()
-    folder, flat, policy = Path(config.options.source), None, None
+    name, flat, policy = config.options.source, None, None
     if config.train.init:
-        model, policy = load_taic(folder, env, config)
+        model, policy = load_taic(name, env, config)
     else:
-        model = load_options(folder, env, config.options, config.seeds)
+        model = load_options(name, env, config.options, config.seeds)
     if "transfer" in config.train.baselines:
-        flat = load_policy(folder, env, config.collect.ppo, config.seeds)
+        flat = load_policy(name, env, config.collect.ppo, config.seeds)
     return Inherited(model, flat, policy)
 
 
@@ -271,13 +271,8 @@ def select_windows(run: Run, env: Env) -> Dataset:
 
 
 def train_over_options(run: Run, env: Env, model: OptionModel, policy: Weights | None = None) -> Trained:
-    """Train the policy that acts by choosing options; a fine-tuned D is saved as the artifact `options_fine_tuned`."""
-    config = run.config
-    trained = _train(run, env, "train", model, begin=policy)
-    if config.train.fine_tune.epochs:
-        executor: Any = trained.agent.executor
-        save_options(run.folder.path / "options_fine_tuned", executor.model, env, config.options)
-    return trained
+    """Train the policy that acts by choosing options, from untrained weights or from these."""
+    return _train(run, env, "train", model, begin=policy)
 
 
 def train_baseline(run: Run, env: Env, name: str, policy: Weights | None = None) -> Trained:

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from probes import assert_trees_equal
+from safetensors.numpy import load_file
 from tiny_runs import (
     CONFIG,
     KilledError,
@@ -59,7 +60,7 @@ def finished(tmp_path_factory) -> Path:
 
 def last_states(folder: Path) -> dict[str, dict[str, np.ndarray]]:
     return {name: load_arrays(folder / "checkpoints" / name / str(steps)) for name, steps in STAGES.items()} | {
-        "options": load_arrays(folder / "options")
+        "options": load_file(folder / "options/arrays.safetensors")
     }
 
 

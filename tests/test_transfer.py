@@ -22,7 +22,7 @@ from tiny_runs import (
 from taic_jax import nonfinite, pipeline
 from taic_jax.config import Config, ConfigError, collector_is_baseline, needs_collect
 from taic_jax.pipeline import make_envs, run_pipeline
-from taic_jax.runtime.checkpoint import Checkpoints, load_arrays
+from taic_jax.runtime.checkpoint import Checkpoints
 from taic_jax.runtime.driver import STAGE_STREAMS
 from taic_jax.summary import plan
 
@@ -86,7 +86,7 @@ def test_frozen_options_are_what_acts_and_stay_as_they_are(source, transferred, 
     monkeypatch.setattr(pipeline, "train_over_options", lambda *args: agents.append(train(*args)) or agents[-1])
     run_pipeline(using(source / "options", seeds=3, train__baselines=()), tmp_path / "run")
     assert files_of(source) == before
-    stored = load_arrays(source / "options")
+    stored = load_file(source / "options/arrays.safetensors")
     acting = jax.tree_util.tree_flatten_with_path(agents[0].agent.executor.model)[0]
     named = {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in acting}
     assert_same_arrays(named, {name: array[[0, 1, 0]] for name, array in stored.items()})

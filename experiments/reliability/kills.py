@@ -23,7 +23,9 @@ from typing import Any
 
 import numpy as np
 import tyro
+from safetensors.numpy import load_file
 
+from taic_jax.artifacts.models import ARRAYS
 from taic_jax.command_line import tell
 from taic_jax.config import CollectConfig, Config, EnvConfig, EvaluateConfig, OptionsConfig, PPOConfig, TrainConfig
 from taic_jax.config_io import to_yaml
@@ -91,6 +93,8 @@ def _arrays(folder: Path) -> Iterator[tuple[str, bytes]]:
         if path.suffix == ".npz":
             with np.load(path) as file:
                 arrays = dict(file)
+        elif path.name == ARRAYS:
+            arrays = load_file(path)
         yield from ((f"{path.relative_to(folder)}/{name}", array.tobytes()) for name, array in arrays.items())
 
 

@@ -1,7 +1,4 @@
-"""Trained agents [K] of a method as an artifact: `arrays.safetensors`, and `description.json` with the run's config.
-
-Both files are data: reading them executes nothing.
-"""
+"""Trained agents [K] of a method as an artifact, whose description has the run's config."""
 
 import dataclasses
 from pathlib import Path
@@ -9,20 +6,22 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import safetensors.numpy
-from safetensors import SafetensorError
 
-from taic_jax import __version__
 from taic_jax.artifacts.models import (
+    AGENTS,
     Body,
     check_description,
     describe,
+    described,
     empty_model,
     for_seeds,
+    load_artifact,
     read_body,
     rows_like,
+    save_artifact,
     structure,
 )
+from taic_jax.artifacts.pretrained import locate
 from taic_jax.config import COLLECT, TAIC, Config, ConfigError, PPOConfig
 from taic_jax.config_io import from_mapping
 from taic_jax.envs.base import Env
@@ -31,11 +30,8 @@ from taic_jax.options.execution import Executor, IdentityExecutor, make_executor
 from taic_jax.options.model import OptionModel
 from taic_jax.rl import normalize
 from taic_jax.rl.agent import Agent
-from taic_jax.runtime.checkpoint import ArtifactError, checksums, fit_tree, plain_arrays
-from taic_jax.runtime.files import DESCRIPTION, atomic_file, read_description, save_json, writes_here, writing
-
-AGENTS, ARRAYS = "agents", "arrays.safetensors"
-FORMAT = 1  # of the two files; a later one is refused
+from taic_jax.runtime.checkpoint import ArtifactError
+from taic_jax.runtime.files import DESCRIPTION
 
 Weights = tuple[PolicyParams, normalize.Statistics]
 """A policy without its executor: its parameters, and the statistics that normalise its observations."""
@@ -49,63 +45,36 @@ class Description(NamedTuple):
     method: str
     seeds: int
     config: Config
-    writer: str
-    checksums: dict[str, int]
 
 
 def save_agents(folder: Path, agents: Agent, env: Env, config: Config, method: str) -> None:
     """Save the agents [K] of a method as the artifact `folder`, or raise SaveError."""
-    arrays = plain_arrays(agents)
-    if writes_here():
-        with writing(folder):
-            folder.mkdir(parents=True, exist_ok=True)
-            (folder / DESCRIPTION).unlink(missing_ok=True)  # until the arrays that it describes are whole
-    with atomic_file(folder / ARRAYS) as file:
-        file.write(safetensors.numpy.save(arrays))
     description = {
-        "format": FORMAT,
-        "taic_jax": __version__,
         "method": method,
         **describe(env),
         "observation_size": env.observation_size,
         "hidden_sizes": list(agents.policy.hidden_sizes),
         **(structure(config.options) if method == TAIC else {}),
         "seeds": len(agents.params.log_std),
-        "crc32": checksums(arrays),
         "config": dataclasses.asdict(config),
     }
-    save_json(folder / DESCRIPTION, description)
+    save_artifact(folder, agents, description)
 
 
 def read_agents(folder: Path) -> Description:
     """Read the description of agents, or raise ArtifactError."""
-    description = read_description(folder)
-    if description is None:
-        raise ArtifactError(f"{folder}: expected a run that got this far, or its agents; got none")
-    if not isinstance(version := description.get("format"), int):
-        raise ArtifactError(f"{folder / DESCRIPTION}: expected the description of an artifact, got another file")
-    if version > FORMAT:
-        writer = f"taic_jax {description.get('taic_jax')} wrote format {version}"
-        raise ArtifactError(f"{folder}: {writer}, this is taic_jax {__version__}, which reads formats to {FORMAT}")
+    description = described(folder, "agents")
     try:
         size, method, seeds = (description[name] for name in ("observation_size", "method", "seeds"))
-        config, writer, sums = from_mapping(description["config"]), description["taic_jax"], description["crc32"]
-        return Description(read_body(folder), size, method, seeds, config, writer, sums)
+        return Description(read_body(folder), size, method, seeds, from_mapping(description["config"]))
     except (KeyError, ConfigError) as error:
         raise ArtifactError(f"{folder / DESCRIPTION}: expected the description of agents: {error}") from None
 
 
 def load_agents(folder: Path) -> Agent:
     """Load agents [K], or raise ArtifactError if their files are damaged or of another structure."""
-    description, path = read_agents(folder), folder / ARRAYS
-    try:
-        arrays = safetensors.numpy.load_file(path)
-        if checksums(arrays) != description.checksums:
-            raise SafetensorError
-    except (OSError, SafetensorError):
-        raise ArtifactError(f"{path}: expected an artifact, got files of another kind or damaged ones") from None
-    like = rows_like(description.seeds, lambda: _empty_agent(description))
-    return fit_tree(path, arrays, description.writer, like)
+    description = read_agents(folder)
+    return load_artifact(folder, "agents", rows_like(description.seeds, lambda: _empty_agent(description)))
 
 
 def _empty_agent(description: Description) -> Agent:
@@ -121,24 +90,24 @@ def _empty_agent(description: Description) -> Agent:
     return Agent(executor, policy.init(jax.random.key(0), size, 0.0), normalize.init((size,)), policy)
 
 
-def load_taic(source: Path, env: Env, config: Config) -> tuple[OptionModel, Weights]:
+def load_taic(source: str, env: Env, config: Config) -> tuple[OptionModel, Weights]:
     """Load a run's options, fine-tuned if it did so, and its policies over them, for the seeds of another config.
 
     Seed k takes the k-th, modulo their number. Raise ArtifactError for another body, observation or structure.
     """
-    folder = source / AGENTS / TAIC
+    folder = locate(source) / AGENTS / TAIC
     fields = {"observation_size": env.observation_size, "hidden_sizes": list(config.train.ppo.hidden_sizes)}
     check_description(folder, "policy over options", env, fields | structure(config.options))
     agents: Any = load_agents(folder)
     return for_seeds(config.seeds, (agents.executor.model, (agents.params, agents.obs_statistics)))
 
 
-def load_policy(source: Path, env: Env, config: PPOConfig, seeds: int) -> Weights:
+def load_policy(source: str | Path, env: Env, config: PPOConfig, seeds: int) -> Weights:
     """Load the collector's policies [seeds] of a run on another task of the same body, or raise ArtifactError.
 
     Input weights of the proprioceptive slice are copied; other observations of `env` get zeros and new statistics.
     """
-    folder = source / AGENTS / COLLECT
+    folder = locate(source) / AGENTS / COLLECT
     check_description(folder, "flat policy", env, {"hidden_sizes": list(config.hidden_sizes)})
     agents = load_agents(folder)
     params, statistics = for_seeds(seeds, (agents.params, agents.obs_statistics))

@@ -1,4 +1,7 @@
-"""Artifacts of a run for other runs: their descriptions in `description.json`, and folders of option models [K]."""
+"""Artifacts of a run for other runs: folders of `arrays.safetensors` and `description.json`; option models [K].
+
+Both files are data: reading them executes nothing.
+"""
 
 from collections.abc import Callable
 from functools import partial
@@ -7,14 +10,20 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import safetensors.numpy
+from safetensors import SafetensorError
 
-from taic_jax.config import OptionsConfig
+from taic_jax import __version__
+from taic_jax.artifacts.pretrained import locate
+from taic_jax.config import TAIC, OptionsConfig
 from taic_jax.envs.base import Env
 from taic_jax.options.model import OptionModel, Scale, init_params, make_networks
-from taic_jax.runtime.checkpoint import ArtifactError, Tree, load_tree, save_tree
-from taic_jax.runtime.files import DESCRIPTION, read_description, save_json
+from taic_jax.runtime.checkpoint import ArtifactError, Tree, checksums, fit_tree, plain_arrays
+from taic_jax.runtime.files import DESCRIPTION, atomic_file, read_description, save_json, writes_here, writing
 
-OPTIONS = "options"
+OPTIONS, AGENTS, ARRAYS = "options", "agents", "arrays.safetensors"
+FORMAT = 1  # of the two files; a later one is refused
+MODEL = "executor.model."  # begins the names of an option model's arrays among those of agents
 
 # The fields in which a frozen option model must agree with the config that uses it: its shapes and their meaning.
 STRUCTURE = ("decoder", "size", "length", "termination", "hidden_size", "mlp_sizes", "decoder_sizes")
@@ -50,11 +59,7 @@ def describe(env: Env | Body) -> dict[str, Any]:
 
 def check_description(folder: Path, kind: str, env: Env | Body, fields: dict[str, Any]) -> dict[str, Any]:
     """Return an artifact's description, or raise ArtifactError where it differs from this body and these fields."""
-    description = read_description(folder)
-    if description is None:
-        raise ArtifactError(f"{folder}: expected a run that got this far, or its {kind}; got none")
-    if not isinstance(description.get("seeds"), int):
-        raise ArtifactError(f"{folder / DESCRIPTION}: expected the description of an artifact, got another file")
+    description = described(folder, kind)
     body = {name: value for name, value in describe(env).items() if name != "env"}
     for name, value in {**body, **fields}.items():
         value = list(value) if isinstance(value, tuple) else value
@@ -64,17 +69,69 @@ def check_description(folder: Path, kind: str, env: Env | Body, fields: dict[str
     return description
 
 
+def described(folder: Path, kind: str) -> dict[str, Any]:
+    """Return an artifact's description, or raise ArtifactError without one, or if its format is a later one."""
+    description = read_description(folder)
+    if description is None:
+        raise ArtifactError(f"{folder}: expected a run that got this far, or its {kind}; got none")
+    if not isinstance(description.get("seeds"), int):
+        raise ArtifactError(f"{folder / DESCRIPTION}: expected the description of an artifact, got another file")
+    if (version := description.get("format", FORMAT)) > FORMAT:
+        writer = f"taic_jax {description.get('taic_jax')} wrote format {version}"
+        raise ArtifactError(f"{folder}: {writer}, this is taic_jax {__version__}, which reads formats to {FORMAT}")
+    return description
+
+
+def save_artifact(folder: Path, tree: Any, description: dict[str, Any]) -> None:
+    """Save a tree of arrays as the artifact `folder`, or raise SaveError."""
+    arrays = plain_arrays(tree)
+    if writes_here():
+        with writing(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+            (folder / DESCRIPTION).unlink(missing_ok=True)  # until the arrays that it describes are whole
+    with atomic_file(folder / ARRAYS) as file:
+        file.write(safetensors.numpy.save(arrays))
+    about = {"format": FORMAT, "taic_jax": __version__, "crc32": checksums(arrays)}
+    save_json(folder / DESCRIPTION, about | description)
+
+
+def load_artifact(folder: Path, kind: str, like: Tree, prefix: str = "") -> Tree:
+    """Load the arrays whose names begin with `prefix` as a tree like `like`.
+
+    Raises:
+      ArtifactError: the files are damaged, of a later format, or hold another tree.
+    """
+    description, path = described(folder, kind), folder / ARRAYS
+    try:
+        arrays = safetensors.numpy.load_file(path)
+        if checksums(arrays) != description.get("crc32"):
+            raise SafetensorError
+    except (OSError, SafetensorError):
+        raise ArtifactError(f"{path}: expected an artifact, got files of another kind or damaged ones") from None
+    arrays = {name.removeprefix(prefix): x for name, x in arrays.items() if name.startswith(prefix)}
+    return fit_tree(path, arrays, description["taic_jax"], like)
+
+
 def save_options(folder: Path, model: OptionModel, env: Env, config: OptionsConfig) -> None:
     """Save option models [K] of `env` as the artifact `folder`."""
-    save_tree(folder, model)
-    save_json(folder / DESCRIPTION, describe(env) | structure(config) | {"seeds": len(model.delta)})
+    save_artifact(folder, model, describe(env) | structure(config) | {"seeds": len(model.delta)})
 
 
-def load_options(source: Path, env: Env | Body, config: OptionsConfig, seeds: int) -> OptionModel:
-    """Load option models [seeds] from a run or an artifact, or raise ArtifactError; seed k takes model k modulo K."""
-    folder = source / OPTIONS if (source / OPTIONS).is_dir() else source
+def load_options(source: str | Path, env: Env | Body, config: OptionsConfig, seeds: int) -> OptionModel:
+    """Load option models [seeds] from a source, or raise ArtifactError; seed k takes model k modulo their number."""
+    folder = options_folder(source)
     description = check_description(folder, "option model", env, structure(config))
-    return for_seeds(seeds, load_tree(folder, rows_like(description["seeds"], partial(empty_model, env, config))))
+    like = rows_like(description["seeds"], partial(empty_model, env, config))
+    return for_seeds(seeds, load_artifact(folder, "option model", like, MODEL if "method" in description else ""))
+
+
+def options_folder(source: str | Path) -> Path:
+    """Return the artifact that a source's options are in: those it learnt; else those that its agents act with.
+
+    A source is the folder of a run, or of an artifact, or `pretrained:NAME`.
+    """
+    path = locate(source)
+    return next((folder for folder in (path / OPTIONS, path / AGENTS / TAIC) if folder.is_dir()), path)
 
 
 def for_seeds(seeds: int, rows: Tree) -> Tree:

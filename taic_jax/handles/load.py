@@ -9,8 +9,9 @@ from typing import Any
 
 import jax
 
-from taic_jax.artifacts.agents import AGENTS, load_agents, read_agents
-from taic_jax.artifacts.models import STRUCTURE, load_options, read_body
+from taic_jax.artifacts.agents import load_agents, read_agents
+from taic_jax.artifacts.models import AGENTS, STRUCTURE, load_options, read_body
+from taic_jax.artifacts.pretrained import locate
 from taic_jax.config import TAIC, CollectConfig, Config
 from taic_jax.config_io import from_mapping
 from taic_jax.envs.base import Env
@@ -46,32 +47,28 @@ class Handle:
 
 
 def load(source: str | Path) -> Handle:
-    """Load a finished run by its folder, or one of its artifacts, `options` or `agents/METHOD`.
+    """Load a finished run by its folder, `pretrained:NAME`, or an artifact of a run, `options` or `agents/METHOD`.
 
     Raises:
-      ArtifactError: there is neither, the run was not finished, or its files are damaged or of a later version.
+      ArtifactError: there is none, the run was not finished, or its files are damaged or of a later version.
       ConfigError: the config of the run is of another version.
     """
-    path = Path(source)
+    path = locate(source)
     run = RunFolder(path)
-    if run.begun:
-        if not run.finished:
-            raise ArtifactError(f"{path}: expected a finished run, got one that --resume goes on with")
-        return _load_run(path, run.config())
+    if run.begun and not run.finished:
+        raise ArtifactError(f"{path}: expected a finished run, got one that --resume goes on with")
+    if run.begun or (path / AGENTS).is_dir():
+        folders = sorted(folder for folder in (path / AGENTS).glob("*") if folder.is_dir())
+        if path / AGENTS / TAIC not in folders:
+            raise ArtifactError(f"{path / AGENTS}: expected the agents that a run of this version leaves, got none")
+        agents = {folder.name: Seeds(load_agents(folder)) for folder in folders}
+        return _handle(read_agents(path / AGENTS / TAIC).config, agents)
     description = read_description(path)
     if description is None:
         raise ArtifactError(f"{path}: expected the folder of a run, or of an artifact of one; got neither")
     if "method" in description:
         return _handle(read_agents(path).config, {description["method"]: Seeds(load_agents(path))})
     return _load_model(path, description)
-
-
-def _load_run(path: Path, config: Config) -> Handle:
-    folders = sorted(folder for folder in (path / AGENTS).glob("*") if folder.is_dir())
-    agents = {folder.name: Seeds(load_agents(folder)) for folder in folders}
-    if TAIC not in agents:
-        raise ArtifactError(f"{path / AGENTS}: expected the agents that a run of this version leaves, got none")
-    return _handle(config, agents)
 
 
 def _handle(config: Config, agents: dict[str, Seeds[Agent]]) -> Handle:

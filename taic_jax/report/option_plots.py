@@ -11,7 +11,7 @@ import numpy as np
 
 from taic_jax.analysis.option_space import encode_windows
 from taic_jax.artifacts.experience import gather_experience
-from taic_jax.artifacts.models import OPTIONS, load_options, read_body
+from taic_jax.artifacts.models import load_options, options_folder, read_body
 from taic_jax.config import COLLECT, ConfigError, OptionsConfig
 from taic_jax.options.model import OptionModel
 from taic_jax.report.runs import LoadedRun, run_of
@@ -33,8 +33,7 @@ def option_plot(run: LoadedRun, count: int) -> dict[str, Any]:
         return {"missing": "the config is of another version"}
     if run.point:
         return {"missing": "option spaces of a sweep's points are not drawn"}
-    source = Path(run.config.options.source or run.folder)
-    folder = source / OPTIONS if (source / OPTIONS).is_dir() else source
+    folder = options_folder(run.config.options.source or run.folder)
     if folder == run.folder:
         return {"missing": "options are not learnt yet"}
     home, config = _origin(run.folder, run.config.options)

@@ -100,8 +100,8 @@ def read_run(folder: Path, name: str = "") -> LoadedRun:
 
 def run_of(name: str) -> RunFolder:
     """Return the folder of a run, by its path or the path of an artifact in it."""
-    files = RunFolder(Path(name))
-    return files if files.begun else RunFolder(files.path.parent)
+    path = Path(name)
+    return next((run for run in map(RunFolder, [path, *path.parents][:3]) if run.begun), RunFolder(path.parent))
 
 
 def check_seeds(run: LoadedRun) -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from safetensors.numpy import load_file
 from tiny_runs import CONFIG, files_of, last_state, tiny_steps, with_fields
 
 from taic_jax.artifacts.experience import ExperienceStore
@@ -17,7 +18,6 @@ from taic_jax.options import learning
 from taic_jax.options.dataset import Experience
 from taic_jax.options.model import make_networks
 from taic_jax.run import main
-from taic_jax.runtime.checkpoint import load_arrays
 from taic_jax.runtime.driver import STAGE_STREAMS
 from taic_jax.types import as_arrays
 
@@ -62,7 +62,7 @@ def make_demonstrations(path: str, ticks: int, first: float) -> None:
 
 
 def options() -> dict[str, np.ndarray]:
-    return load_arrays(Path("new/options"))
+    return load_file("new/options/arrays.safetensors")
 
 
 def mean_states() -> list[float]:

@@ -170,7 +170,7 @@ def test_a_run_fine_tunes_in_turns_and_goes_on_where_it_stopped(tmp_path, monkey
     assert_same_arrays(*(last_state(tmp_path / name, "train") for name in ("whole", "torn")))
     learnt, tuned = (
         load_options(tmp_path / "whole" / name, make_env("nav2d"), config.options, 2)
-        for name in ("options", "options_fine_tuned")
+        for name in ("options", "agents/taic")
     )
     for name in learnt.params:
         same = [(a == b).all() for a, b in zip(numbers(learnt.params[name]), numbers(tuned.params[name]), strict=True)]
