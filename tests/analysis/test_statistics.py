@@ -55,6 +55,10 @@ def test_interval_narrows_with_less_confidence():
     assert low < low_half < iqm(values) < high_half < high
 
 
+def test_interval_of_two_seeds_spans_them():
+    assert bootstrap_interval([1.0, 3.0]) == (1.0, 3.0)
+
+
 def test_interval_of_one_seed_is_unknown():
     assert all(math.isnan(bound) for bound in bootstrap_interval([3.0]))
 
@@ -97,6 +101,7 @@ def test_a_stratified_interval_never_mixes_groups():
     values = np.arange(12.0)[:, None]
     mixed = stratified_interval([values])
     assert mixed[0] < iqm(values, axis=0) < mixed[1]
+    np.testing.assert_allclose(np.ravel(mixed), bootstrap_interval(values[:, 0]))
     apart = stratified_interval([values[:6], values[6:]])
     assert apart[1] - apart[0] < mixed[1] - mixed[0]
 

@@ -117,23 +117,27 @@ def test_reward_is_the_distance_and_nothing_ends_the_episode(name):
     env, _, step = task(name)
     goal = np.array(env.arena.goal, np.float32)
     lying = [[*goal[:2], 0.3, 0, 1, 0, 0], [goal[0], goal[1] - 4.9, 0.3, 1, 0, 0, 0], [*goal[:2] - 7, 3.0, 1, 0, 0, 0]]
+    lying += [[goal[0], goal[1] - 5.5, 0.3, 1, 0, 0, 0]]
     lying = [[x, y, z + env.arena.ground, *quaternion] for x, y, z, *quaternion in lying]
-    after = step(placed(start(name, 3), lying), jnp.ones((3, 8)))
+    after = step(placed(start(name, 4), lying), jnp.ones((4, 8)))
     distance = np.linalg.norm(np.asarray(after.physics.qpos)[:, : len(goal)] - goal, axis=1)
     np.testing.assert_allclose(after.reward, -distance, rtol=1e-5)
     np.testing.assert_allclose(after.metrics["distance"], distance, rtol=1e-5)
     np.testing.assert_array_equal(after.metrics["success"], distance < 5)
-    np.testing.assert_array_equal(after.metrics["success"], [1, 1, 0])
-    np.testing.assert_array_equal(after.metrics["upside_down"], [1, 0, 0])
+    np.testing.assert_array_equal(after.metrics["success"], [1, 1, 0, 0])
+    np.testing.assert_array_equal(after.metrics["upside_down"], [1, 0, 0, 0])
     assert not after.terminated.any() and not after.truncated.any()
 
 
 def test_closest_approach_is_remembered_within_an_episode():
     _, _, step = task("ant_maze")
     state = start("ant_maze", 1)
+    least = state.physics.closest
     for y, expected in ((0.0, 16.0), (10.0, 6.0), (3.0, 6.0)):
         state = step(placed(state, [[0.0, y, 0.6]]), jnp.zeros((1, 8)))
+        least = jnp.minimum(least, state.metrics["distance"])  # at the end of a tick
         np.testing.assert_allclose(state.metrics["closest_approach"], expected, atol=0.1)
+        np.testing.assert_array_equal(state.metrics["closest_approach"], least)
 
 
 def test_diverged_arena_is_cut_and_not_terminated(monkeypatch, tmp_path):

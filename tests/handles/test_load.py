@@ -12,11 +12,13 @@ from safetensors.numpy import load_file, save_file
 from tiny_runs import CONFIG, with_fields
 
 import taic_jax as taic
+from taic_jax import summary
 from taic_jax.envs.wrappers import AutoReset
 from taic_jax.pipeline import Result
 from taic_jax.rl.agent import advance
 from taic_jax.rl.rollout import rollout, start
 from taic_jax.runtime.checkpoint import ArtifactError
+from taic_jax.runtime.driver import Run
 
 RULES = ("fixed", "output", "predict")
 
@@ -85,6 +87,18 @@ def test_options_alone_are_loaded_with_their_structure(run):
     handle = taic.load(folder / "options")
     assert handle.agents == {} and handle.config.options.length == 4 and handle.env.name == "nav2d"
     assert_trees_equal(handle.options.rows, taic.load(folder).options.rows.replace(delta=handle.options.rows.delta))
+
+
+def test_the_video_is_of_the_first_seed(run, tmp_path, monkeypatch):
+    """What is recorded here is a layer of the policy, and what is drawn is nothing."""
+    handle, seen = taic.load(run[0]), []
+    env, agents = handle.env, handle.agents["taic"].rows
+    monkeypatch.setattr(summary, "record", lambda env, agent, key, ticks: agent.params.actor)
+    monkeypatch.setattr(type(env), "render", lambda env, drawn: seen.append(drawn) or np.zeros((3, 8, 6, 3), np.uint8))
+    with Run.view(CONFIG, tmp_path, CONFIG) as view:
+        summary.write_video(view, env, agents)
+    assert_trees_equal(seen[0], jax.tree.map(lambda x: x[0], agents.params.actor))
+    assert (tmp_path / "video.webp").is_file()
 
 
 def unfinished(folder: Path) -> str:
