@@ -2,7 +2,7 @@
 
 python -m taic_jax.experiments.pretrain [--only NAME ...] [--run-dir DIR]
 
-A finished run is not done again, and an interrupted one goes on.
+A finished run is only evaluated again, and an interrupted one goes on.
 """
 
 import dataclasses
@@ -48,17 +48,17 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 def execute(command: Command) -> None:
-    """Train, or take a finished run, and replace each folder."""
+    """Train, and replace each folder."""
     for name in command.only:
         if name not in CHANGES:
             raise ConfigError(f"--only: expected some of {', '.join(CHANGES)}, got {name}{nearest(name, CHANGES)}")
     keep_programs()
     for name in command.only:
         config = load_config(name)
-        for field, value in {"seeds": 1, "evaluate.video_ticks": 0, **CHANGES[name]}.items():
+        for field, value in {"seeds": 1, "evaluate.episodes": 100, "evaluate.video_ticks": 0, **CHANGES[name]}.items():
             config = replace(config, field, value)
         run = RunFolder(command.run_dir / name)
-        summary = run.summary() if run.finished else run_pipeline(config, run.path, resume=run.begun).summary
+        summary = run_pipeline(config, run.path, resume=run.begun).summary
         shutil.rmtree(FOLDER / name, ignore_errors=True)
         for method in (TAIC, COLLECT):
             shutil.copytree(run.path / AGENTS / method, FOLDER / name / AGENTS / method)
