@@ -2,15 +2,16 @@
 
 from collections.abc import Sequence
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Float, Int, Key
 
 from taic_jax.analysis import measures
 from taic_jax.config import OptionsConfig
-from taic_jax.envs.base import Env
+from taic_jax.envs.base import Env, State
 from taic_jax.envs.wrappers import AutoReset
 from taic_jax.options.dataset import Experience, gather, make_dataset
 from taic_jax.options.execution import Executor, make_executor
@@ -50,6 +51,26 @@ def execute(
     last, size = jnp.argmax(ticks.ended, axis=0), env.proprioceptive_size
     end = jnp.take_along_axis(ticks.final_obs, last[None, :, None], axis=0)[0]
     return Effects(option, ticks.obs[0, :, :size], end[:, :size], last + 1)
+
+
+def replay(
+    env: AutoReset, executor: Executor, state: State, option: Float[Array, "N D"], key: Key[Array, ""], times: Any,
+    most: int,
+) -> tuple[State, Int[Array, " N"]]:  # fmt: skip
+    """Execute each of N options `times` <= `most` times in a row, all from one state.
+
+    Returns:
+      The states [T + 1, N, ...], T = most * L, from this one on, and the ticks [N] after which they stay the same, as
+      the options have ended or the next tick ends the episode.
+    """
+    count, ticks = len(option), most * executor.length
+    same = jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), state)
+    begin = start(env, executor, count, key).replace(env=same)
+    _, run = rollout(env, executor, partial(always, option), begin, key, ticks, lambda state: state)
+    over = jnp.cumsum(run.terminated | run.truncated, axis=0) > 0  # the state is already of the next episode
+    last = jnp.sum((jnp.cumsum(run.decision, axis=0) <= times) & ~over, axis=0)
+    tick, rows = jnp.minimum(jnp.arange(ticks + 1)[:, None], last[None]), jnp.arange(count)
+    return jax.tree.map(lambda x, later: jnp.concatenate([x[None], later])[tick, rows], same, run.extras), last
 
 
 def always(option: Float[Array, "B D"], obs: Float[Array, "B S"], noise: Array) -> tuple[Array, Array]:

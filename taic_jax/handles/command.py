@@ -17,21 +17,27 @@ if TYPE_CHECKING:  # it imports JAX, without which the command lines answer
 
 
 @dataclass(frozen=True)
-class Command:
-    """Arguments of a command on the agents of a finished run."""
+class Source:
+    """Arguments of a command on a finished run."""
 
     run: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="RUN")] = ""
     """Folder of a finished run, or of the agents of a method in it."""
-    methods: tuple[str, ...] = ()
-    """Methods by name, such as taic and flat; none takes those that the command is for."""
     key: int = 0
     """Seed of the PRNG key that the episodes are drawn with."""
-    explore: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Act with the noise of training, in place of the mean options or actions."""
     env: Annotated[EnvConfig, tyro.conf.FlagConversionOff] = EnvConfig()
 
 
-C = TypeVar("C", bound=Command)
+@dataclass(frozen=True)
+class Command(Source):
+    """Arguments of a command on the agents of a finished run."""
+
+    methods: tuple[str, ...] = ()
+    """Methods by name, such as taic and flat; none takes those that the command is for."""
+    explore: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Act with the noise of training, in place of the mean options or actions."""
+
+
+C = TypeVar("C", bound=Source)
 
 
 def answer(args: Sequence[str] | None, program: str, kind: type[C], execute: Callable[[C, "Handle"], object]) -> int:
