@@ -35,6 +35,7 @@ def render_mujoco(
     """
     model.vis.global_.offwidth = max(model.vis.global_.offwidth, width)
     model.vis.global_.offheight = max(model.vis.global_.offheight, height)
+    model.vis.quality.shadowsize = 1024  # looks as 4096 does, MuJoCo's default, and takes a third of the time on a CPU
     camera_id = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, camera)  # -1 means a free one
     data = mujoco.MjData(model)
     frames = []
