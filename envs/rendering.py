@@ -1,6 +1,7 @@
 """Pictures of MuJoCo scenes, drawn on the host, and animations."""
 
 import importlib
+import io
 import os
 import sys
 import tempfile
@@ -67,7 +68,7 @@ def write_webp(file: Path | BinaryIO, frames: Frames, dt: float) -> None:
     _animate(file, frames, dt, "webp")
 
 
-def write_film(path: Path, file: BinaryIO, frames: Frames, dt: float) -> None:
+def write_film(path: Path, file: BinaryIO | io.BytesIO, frames: Frames, dt: float) -> None:
     """Write an animation as `write_webp` does, in the format that the path's ending names, one of FILMS.
 
     Raises:
@@ -110,6 +111,6 @@ def _every(dt: float) -> int:
     return max(round(0.04 / dt), 1)
 
 
-def _animate(file: Path | BinaryIO, frames: Frames, dt: float, kind: str) -> None:
+def _animate(file: Path | BinaryIO | io.BytesIO, frames: Frames, dt: float, kind: str) -> None:
     first, *others = [Image.fromarray(frame) for frame in frames[:: _every(dt)]]
     first.save(file, format=kind, save_all=True, append_images=others, duration=round(1000 * dt * _every(dt)), loop=0)

@@ -17,6 +17,7 @@ COMMANDS = {
     "report": "write one HTML page about runs and sweeps",
     "presets": "list the configs that ship with the package",
     "envs": "draw every task",
+    "completion": "print a script that completes this command in bash, zsh or tcsh",
 }
 HELP = """usage: taic COMMAND ...
 
@@ -47,7 +48,14 @@ def main(args: Sequence[str] | None = None) -> int:
         case "presets":
             from taic_jax.handles.presets import main as command
         case "envs":
-            from taic_jax.envs.__main__ import main as command
+            from taic_jax.handles.pictures import main as command
+        case "completion":
+            from taic_jax.handles.completion import complete
+            from taic_jax.report.__main__ import Command as Report
+            from taic_jax.run import Command as Run
+            from taic_jax.sweep.__main__ import Command as Sweep
+
+            return tell(lambda: complete(rest, COMMANDS, {"run": Run, "sweep": Sweep, "report": Report}))
         case _:
             return tell(lambda: _about(name))
     return command(rest)

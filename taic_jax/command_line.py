@@ -24,7 +24,7 @@ from typing import Annotated, Any, TypeVar
 import tyro
 
 from taic_jax import __version__
-from taic_jax.config import Config, ConfigError, Shard, field_types, impossible, replace, walk
+from taic_jax.config import Config, ConfigError, Shard, Track, field_types, impossible, replace, walk
 from taic_jax.config_io import as_integer, load_config, mistyped, nearest, preset_names, validate
 from taic_jax.runtime.files import SaveError
 from taic_jax.runtime.signals import DivergedError, Interrupted, Signals
@@ -57,9 +57,11 @@ class Command:
     overwrite: tyro.conf.FlagCreatePairsOff[bool] = False
     """Replace the run in --run-dir."""
     dry_run: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Check all that the run would refuse, print the configuration and the plan, and stop."""
+    """Check all that the run would refuse, print the plan, with minutes by first steps unless --quiet, and stop."""
     quiet: tyro.conf.FlagCreatePairsOff[bool] = False
     """Show neither progress nor the table at the end, only the path of the results."""
+    track: Track = "none"
+    """Experiment tracker to send metrics and config to; an extra of the same name installs it."""
     version: tyro.conf.FlagCreatePairsOff[bool] = False
     """Print the version and stop."""
     checkpoint_seconds: float = 30.0

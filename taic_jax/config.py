@@ -37,7 +37,8 @@ Positive = Annotated[float, Bounds(TINY)]
 Share = Annotated[float, Bounds(0, 1)]
 LogStd = Annotated[float, Bounds(-20, 2)]
 Shard = Literal["auto", "none", "seeds", "envs"]
-"""The axis to split over devices; it is not a part of an experiment, but is needed without JAX."""
+Track = Literal["none", "wandb", "trackio"]
+"""The axis to split over devices, and a tracker; no parts of an experiment, but needed without JAX."""
 
 
 @dataclass(frozen=True)

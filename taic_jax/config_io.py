@@ -77,6 +77,20 @@ def to_yaml(config: Config) -> str:
     return yaml.safe_dump(dataclasses.asdict(config), sort_keys=False)
 
 
+def differences(config: Any, default: Any = None, indent: str = "") -> str:
+    """Write the fields that differ from the defaults, each default as a comment; `load_config` reads the same back."""
+    default, lines = default or type(config)(), []
+    for field in dataclasses.fields(config):
+        value, old = getattr(config, field.name), getattr(default, field.name)
+        if dataclasses.is_dataclass(value):
+            inner = differences(value, old, f"{indent}  ")
+            lines += [f"{indent}{field.name}:", inner] if inner else []
+        elif value != old:
+            new, usual = (yaml.safe_dump([x], default_flow_style=True, width=math.inf)[1:-2] for x in (value, old))
+            lines.append(f"{indent}{field.name}: {new}  # by default {usual}")
+    return "\n".join(lines)
+
+
 def preset_names() -> list[str]:
     """List the presets that ship with the package."""
     return sorted(file.name.removesuffix(".yaml") for file in _PRESETS.iterdir() if file.name.endswith(".yaml"))

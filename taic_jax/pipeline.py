@@ -59,7 +59,7 @@ def run_pipeline(
         one point after another.
       shard: the axis to split over all devices: rows, or environments.
       quiet: show no progress on standard error.
-      **settings: the `signals`, `checkpoint_seconds` and `population` of `Run`.
+      **settings: the `signals`, `checkpoint_seconds`, `population` and `most` of `Run`.
 
     Raises:
       Interrupted: a signal stopped the run; `resume` continues it.
@@ -83,14 +83,13 @@ def run_pipeline(
             methods[name] = done or train_baseline(run, env, name, flat)
         for name, trained in methods.items():
             save_agents(run.folder.path / AGENTS / name, trained.agent, env, run.folder.config(), name)
-    summary = as_summary(run, methods)
-    save_json(run.folder.summary_path, summary)
-    result = Result(summary, {name: Seeds(trained.agent) for name, trained in methods.items()})
-    try:
-        write_video(run, env, methods[TAIC].agent)
-    except RenderingError as error:  # nothing else depends on it, and all results are saved
-        print(f"taic_jax: no video: {error}", file=sys.stderr)
-    return result
+        summary = as_summary(run, {} if run.most else methods)
+        save_json(run.folder.summary_path, summary)
+        try:
+            write_video(run, env, methods[TAIC].agent)
+        except RenderingError as error:  # nothing else depends on it, and all results are saved
+            print(f"taic_jax: no video: {error}", file=sys.stderr)
+    return Result(summary, {name: Seeds(trained.agent) for name, trained in methods.items()})
 
 
 def check_run(
@@ -190,9 +189,12 @@ def _train(
     one = make(*rows)
     state = jax.jit(partial(trainer.init_rows, make))(rows, keys)
     state = one.begin(state, *begin) if begin else state
-    compiled = _compile_rows(run, stage, partial(trainer.assess_rows, make), rows, run.stage_keys("evaluate"), state)
+    args = rows, run.stage_keys("evaluate"), state
+    compiled = None if run.most else _compile_rows(run, stage, partial(trainer.assess_rows, make), *args)
 
     def assess(state: Any) -> dict:
+        if compiled is None:
+            return {}
         with run.logger.doing(f"{stage}: evaluating"):
             return jax.device_get(compiled(rows, run.stage_keys("evaluate"), state))
 

@@ -1,17 +1,18 @@
 """The command line: `python -m taic_jax.run [CONFIG] [--run-dir DIR] [--section.field value ...]`."""
 
 import sys
+import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
 from taic_jax import command_line
 from taic_jax.command_line import FAILED, answer, attempt
 from taic_jax.config import ConfigError, impossible
-from taic_jax.config_io import to_yaml
+from taic_jax.config_io import differences
 from taic_jax.runtime.signals import Signals
 
 PROGRAM = "python -m taic_jax.run"
@@ -67,26 +68,36 @@ def execute(command: Command) -> int:
 
     from taic_jax.pipeline import check_run, run_pipeline
     from taic_jax.runtime.devices import open_devices
-    from taic_jax.runtime.hosts import Hosts
+    from taic_jax.runtime.hosts import ALONE, Hosts
     from taic_jax.runtime.program_cache import keep_programs
     from taic_jax.runtime.run_folder import RunFolder
+    from taic_jax.runtime.tracking import follow, tracker_package
     from taic_jax.summary import as_table, plan
 
-    if command.dry_run:
-        envs = check_run(command.config, command.run_dir, resume=command.resume, overwrite=command.overwrite)
-        print(to_yaml(command.config))
-        print(plan(command.config, *envs))
-        return 0
+    tracker_package(command.track)  # refuses first
     keep_programs()
-    hosts = Hosts(command.coordinator, command.hosts, command.host)
+    hosts = ALONE if command.dry_run else Hosts(command.coordinator, command.hosts, command.host)
     shard = open_devices(command.shard, command.config.seeds, hosts)
-    run_dir = command.folder
+    run_dir, config = command.folder, command.config
+    begin: dict[str, Any] = {"resume": command.resume, "overwrite": command.overwrite}
+    if command.dry_run:
+        envs = check_run(config, command.run_dir, **begin)
+        print(differences(config) or "{}  # the defaults", plan(config, *envs), sep="\n\n")
+        if not command.quiet:
+            from taic_jax.handles.calibration import calibrate
+
+            with tempfile.TemporaryDirectory() as folder:
+                print(calibrate(config, Path(folder) / "run", shard))
+        return 0
 
     def work(signals: Signals) -> None:
-        summary, _ = run_pipeline(
-            command.config, run_dir, resume=command.resume, overwrite=command.overwrite, quiet=command.quiet,
-            signals=signals, checkpoint_seconds=command.checkpoint_seconds, shard=shard,
-        )  # fmt: skip
+        if command.track != "none":
+            RunFolder(run_dir).check(config, **begin)  # before the tracker has a run
+        with follow(command.track, RunFolder(run_dir), config, run_dir.resolve().name, resume=command.resume):
+            summary, _ = run_pipeline(
+                config, run_dir, **begin, quiet=command.quiet, signals=signals,
+                checkpoint_seconds=command.checkpoint_seconds, shard=shard,
+            )  # fmt: skip
         if not command.quiet:
             Console().print(as_table(summary))
             print(f"compare and look at runs:  python -m taic_jax.report {run_dir}")

@@ -31,8 +31,8 @@ MIB = 2**20
 
 def plan(config: Config, env: Env, source: Env) -> str:
     """Return the cost of a run: interactions and memory, one line per stage."""
-    collect, options, train = config.collect, config.options, config.train
-    rows = [("collect", source, collect.ppo, collect.ticks)] if needs_collect(config) else []
+    collect, options, train, collects = config.collect, config.options, config.train, needs_collect(config)
+    rows = [("collect", source, collect.ppo, collect.ticks)] if collects else []
     rows.append(("train", env, train.ppo, train.ticks))
     for name in train.baselines:
         if not (name == "flat" and collector_is_baseline(config)):
@@ -42,13 +42,9 @@ def plan(config: Config, env: Env, source: Env) -> str:
         iterations = num_iterations(ppo, ticks)
         real = iterations * ppo.num_envs * ppo.rollout_length
         lines.append(f"{stage:8} {task.name}: {real:,} ticks x {config.seeds} seeds in {iterations} iterations")
-    collects = needs_collect(config)
-    if options.source:
-        learn = f"{'options':8} as learnt in {options.source}"
-    else:
-        names = ", ".join(options.experience or (COLLECT,))
-        learn = f"{'learn':8} {options.steps:,} gradient steps on windows of {options.length} ticks from {names}"
-    lines.insert(1 if collects else 0, learn)
+    names = ", ".join(options.experience or (COLLECT,))
+    learn = f"{'learn':8} {options.steps:,} gradient steps on windows of {options.length} ticks from {names}"
+    lines.insert(int(collects), f"{'options':8} as learnt in {options.source}" if options.source else learn)
     if collects:
         size = experience_bytes(source, experience_ticks(collect)) * config.seeds / MIB
         if experience_ticks(collect) < collect.ticks:
@@ -144,3 +140,4 @@ def write_video(run: Run, env: Env, agent: Agent) -> None:
     frames = env.render(jax.device_get(physics))
     with atomic_file(run.folder.path / "video.webp") as file:
         write_webp(file, frames, env.dt)
+    run.logger.show("video", run.config.train.ticks, frames, env.dt)

@@ -96,12 +96,14 @@ def test_the_version_is_that_of_the_package(capsys):
     assert capsys.readouterr().out == f"taic_jax {__version__}\n"
 
 
-def test_dry_run_prints_the_config_and_the_plan_and_stops(pipeline, capsys):
-    assert main(["ant", "--seed", "3", "--dry-run"]) == 0
-    out = capsys.readouterr().out
-    Path("printed.yaml").write_text(out.replace("the plan", ""))
-    assert load_config("printed.yaml") == parse(["ant", "--seed", "3"]).config
-    assert out.endswith("the plan\n") and pipeline == []
+def test_dry_run_prints_the_differences_and_the_plan_and_stops(pipeline, capsys):
+    Path("empty.yaml").write_text("{}")
+    for args in (["ant", "--seed", "3", "--train.baselines"], ["transfer_ant_maze", "--options", "a"], ["empty.yaml"]):
+        assert main([*args, "--dry-run", "--quiet"]) == 0
+        Path("printed.yaml").write_text((out := capsys.readouterr().out).replace("the plan", ""))
+        assert load_config("printed.yaml") == parse(args).config
+        assert ("# by default nav2d\n" in out) == ("ant" in args[0]) and "gamma: 0.99 " not in out
+        assert out.endswith("\n\nthe plan\n") and pipeline == []
 
 
 def test_options_of_a_run_are_short_for_their_source():

@@ -24,7 +24,7 @@ MISSING_RUNS = {
 }
 
 
-@pytest.mark.parametrize("dry", ["", " --dry-run"], ids=["run", "dry run"])
+@pytest.mark.parametrize("dry", ["", " --dry-run --quiet"], ids=["run", "dry run"])
 @pytest.mark.parametrize(("args", "message"), MISSING_RUNS.values(), ids=MISSING_RUNS)
 def test_a_dry_run_refuses_whatever_the_run_would(capfd, args, message, dry):
     Path("used").mkdir()
@@ -38,7 +38,7 @@ def test_a_dry_run_refuses_whatever_the_run_would(capfd, args, message, dry):
 @pytest.mark.parametrize("module", ["run", "sweep", "experiments.evidence"])
 def test_a_reader_that_has_seen_enough_is_no_error(module):
     """As `head -c 1` does: the pipe is closed before the process writes its last lines."""
-    args = {"run": ["--dry-run"], "sweep": ["--help"], "experiments.evidence": ["--list"]}[module]
+    args = {"run": ["--dry-run", "--quiet"], "sweep": ["--help"], "experiments.evidence": ["--list"]}[module]
     command = [sys.executable, "-m", f"taic_jax.{module}", *args]
     root = Path(run.__file__).parents[1]
     child = subprocess.Popen(command, cwd=root, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)

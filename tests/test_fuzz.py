@@ -71,7 +71,7 @@ def answer(args: list[str]) -> tuple[int, str]:
     """Return the exit code of a dry run, and what it said was wrong."""
     out, err = io.StringIO(), io.StringIO()
     with redirect_stdout(out), redirect_stderr(err):
-        code = main([*args, "--dry-run"])
+        code = main([*args, "--dry-run", "--quiet"])
     told = err.getvalue()
     assert code in (0, 2), (code, told)
     if code == 2:

@@ -3,6 +3,7 @@
 import dataclasses
 import gc
 import json
+import shutil
 import subprocess
 import sys
 import weakref
@@ -92,6 +93,14 @@ def test_leaves_a_whole_run_behind(finished):
         assert len(result["ci95"]) == 2 and -200 <= result["iqm"] <= 100
     with Image.open(finished / "video.webp") as video:
         assert video.format == "WEBP"
+
+
+def test_tensorboard_has_the_video_once_also_after_a_resume(finished, tmp_path):
+    folder = Path(shutil.copytree(finished, tmp_path / "run"))
+    run_pipeline(CONFIG, folder, resume=True)
+    for path in (finished, folder):
+        events = b"".join(file.read_bytes() for file in (path / "tensorboard").iterdir())
+        assert events.count(b"GIF89a") == events.count(b"\x05video") == 1
 
 
 def test_logs_every_step_of_every_stage(finished):

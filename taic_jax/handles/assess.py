@@ -1,6 +1,5 @@
 """Evaluate the agents of a finished run anew: `taic evaluate RUN`; see docs/use.md. Nothing is trained or changed."""
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,7 +29,7 @@ class Command(command.Command):
     """File for all that was measured, per seed."""
 
 
-def main(args: Sequence[str] | None = None) -> int:
+def main(args: Sequence[str]) -> int:
     """Run one command and return its exit code: 0, or 2 for a mistake."""
     return answer(args, PROGRAM, Command, execute)
 
@@ -39,20 +38,28 @@ def execute(command: Command, handle: "Handle") -> None:
     """Evaluate, print the table and write the file."""
     if command.episodes < 1:
         raise impossible("--episodes", command.episodes, "at least 1", 1)
+    if command.out and not command.out.parent.is_dir():
+        raise impossible("--out", command.out, "a file in a folder that exists", command.out.name)
     methods = methods_of(command, handle)
     from rich.console import Console
 
     from taic_jax.runtime.files import save_json
+    from taic_jax.runtime.run_folder import RunFolder
 
-    results = {name: measure(handle, name, command) for name in methods}
+    run = RunFolder(Path(command.run))
+    trained: Any = run.summary()["methods"] if run.finished else {}
+    results = {name: measure(handle, name, command, trained.get(name)) for name in methods}
     if command.out:
         about = {"run": command.run, "env": handle.config.env.name, "episodes": command.episodes, "key": command.key}
         save_json(command.out, {**about, "explore": command.explore, "taic_jax": __version__, "methods": results})
     Console().print(as_table(results, f"return on {handle.env.name}, {command.episodes} episodes a seed"))
 
 
-def measure(handle: "Handle", method: str, command: Command) -> dict[str, Any]:
-    """Return statistics over seeds of the return, the ticks of episodes and options, and the task's metrics."""
+def measure(handle: "Handle", method: str, command: Command, trained: Any = None) -> dict[str, Any]:
+    """Return statistics over seeds of the return, the ticks of episodes and options, and the task's metrics.
+
+    Seeds that stopped in training have no numbers, as in the summary `trained` of the method.
+    """
     import jax
     import numpy as np
 
@@ -68,7 +75,8 @@ def measure(handle: "Handle", method: str, command: Command) -> dict[str, Any]:
     values = jax.device_get(jax.jit(jax.vmap(one))(agents.rows, keys))
     counts = values.pop("durations")
     values["duration"] = counts @ np.arange(1.0, counts.shape[1] + 1) / counts.sum(axis=1)
-    return {name: summarize(x) for name, x in values.items()}
+    lost = [x is None for x in trained["return"]["per_seed"]] if trained else False
+    return {name: summarize(np.where(lost, np.nan, x)) for name, x in values.items()}
 
 
 def as_table(results: dict[str, dict[str, Any]], title: str) -> Any:
@@ -79,14 +87,14 @@ def as_table(results: dict[str, dict[str, Any]], title: str) -> Any:
     labels = [METHOD_LABELS.get(method, method) for method in results]
     table = Table("", *labels, box=SIMPLE, title=title, title_justify="left", title_style="")
     returns = [values["return"] for values in results.values()]
-    table.add_row("mean", *(f"{x['mean']:,.1f}" for x in returns))
-    table.add_row("interquartile mean", *(f"{x['iqm']:,.1f}" for x in returns))
-    intervals = ["one seed" if x["ci95"][0] is None else "{:,.1f} … {:,.1f}".format(*x["ci95"]) for x in returns]
+    table.add_row("mean", *(_cell(",.1f", x["mean"]) for x in returns))
+    table.add_row("interquartile mean", *(_cell(",.1f", x["iqm"]) for x in returns))
+    intervals = ["one seed" if len(x["per_seed"]) == 1 else _cell(",.1f", *x["ci95"]) for x in returns]
     table.add_row("95 % interval", *intervals, end_section=True)
     for name in sorted(set(next(iter(results.values()))) - {"return"}):
-        table.add_row(NAMES.get(name, name), *(f"{values[name]['mean']:.4g}" for values in results.values()))
+        table.add_row(NAMES.get(name, name), *(_cell(".4g", values[name]["mean"]) for values in results.values()))
     return table
 
 
-if __name__ == "__main__":
-    sys.exit(main())
+def _cell(form: str, *values: float | None) -> str:
+    return " … ".join("a seed diverged" if x is None else format(x, form) for x in dict.fromkeys(values))

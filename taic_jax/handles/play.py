@@ -1,6 +1,5 @@
 """Film the agents of a finished run: `taic play RUN`; see docs/use.md. Nothing is trained or changed."""
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,7 +33,7 @@ class Command(command.Command):
     """Film to write: a name that ends in .webp, .gif or, with the extra video, .mp4."""
 
 
-def main(args: Sequence[str] | None = None) -> int:
+def main(args: Sequence[str]) -> int:
     """Run one command and return its exit code: 0, or 2 for a mistake or a machine that cannot draw."""
     return answer(args, PROGRAM, Command, execute)
 
@@ -51,6 +50,8 @@ def execute(command: Command, handle: "Handle") -> None:
     from taic_jax.runtime.files import atomic_file
 
     check_film(command.out)
+    if not command.out.parent.is_dir():
+        raise impossible("--out", command.out, "a file in a folder that exists", command.out.name)
     films = [film(handle, name, command) for name in methods]
     frames = np.concatenate([np.pad(x, ((0, max(map(len, films)) - len(x)), *[(0, 0)] * 3), "edge") for x in films], 2)
     with atomic_file(command.out) as file:
@@ -107,7 +108,3 @@ def with_options(frames: np.ndarray, options: np.ndarray, decision: np.ndarray) 
             if decision[t - age]:
                 frame[-strip:, max(right - cell, 0)] = MARK
     return frames
-
-
-if __name__ == "__main__":
-    sys.exit(main())

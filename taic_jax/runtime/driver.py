@@ -84,6 +84,7 @@ class Run:
     stopped: dict[str, Stopped] = field(default_factory=dict)
     devices: Devices = Devices()
     population: Population | None = None
+    most: int = 0  # steps of each stage that a calibration takes; 0 for all
 
     @classmethod
     @contextlib.contextmanager
@@ -215,6 +216,7 @@ def drive(
       DivergedError: every seed has stopped.
       SaveError: a file cannot be written; earlier checkpoints stay.
     """
+    num_steps = min(num_steps, run.most or num_steps)
     checkpoints = Checkpoints(run.folder.path / "checkpoints" / stage)
     guard, first = resume(checkpoints, begin(state, run.inherited(stage)))
     run.clock.ticks += first * ticks

@@ -5,6 +5,7 @@ written anew.
 """
 
 import contextlib
+import io
 import json
 import shutil
 import time
@@ -14,9 +15,11 @@ from typing import Any, Literal
 
 import numpy as np
 from tensorboardX.proto.event_pb2 import Event  # pyright: ignore[reportAttributeAccessIssue]
+from tensorboardX.proto.summary_pb2 import Summary  # pyright: ignore[reportAttributeAccessIssue]
 from tensorboardX.record_writer import RecordWriter
 from tensorboardX.summary import histogram_raw, scalar
 
+from taic_jax.envs.rendering import Frames, write_film
 from taic_jax.runtime.files import json_safe, save_text, writing
 from taic_jax.runtime.progress import Display, Work
 from taic_jax.runtime.run_folder import Row, RunFolder
@@ -79,14 +82,21 @@ class RunLogger:
         with writing(self._events_dir):
             self._events.flush()
         if work := self._display.work:
-            work.done, work.unit, work.result = count, unit, _mean(row.get(f"{stage}/return"))
+            work.done, work.unit, work.result = count, unit, mean_of(row.get(f"{stage}/return"))
             work.seeds = max(len(value) if isinstance(value, list) else 1 for value in row.values())
             self._display.update(work)
+
+    def show(self, name: str, count: int, frames: Frames, dt: float) -> None:
+        """Write an event with an animation, which TensorBoard plays; `truncate` drops it, so it belongs at the end."""
+        gif, (_, height, width, _) = io.BytesIO(), frames.shape
+        write_film(Path("film.gif"), gif, frames, dt)
+        image = Summary.Image(height=height, width=width, colorspace=3, encoded_image_string=gif.getvalue())
+        self._write_event(Summary(value=[Summary.Value(tag=name, image=image)]), count, time.time())
 
     def truncate(self, stage: str, count: int) -> None:
         """Drop the rows of a stage after `count`, which a resumed run writes again; -1 drops them all."""
         rows = self._folder.metrics()
-        remaining = [row for row in rows if row["stage"] != stage or _count(row) <= count]
+        remaining = [row for row in rows if row["stage"] != stage or count_of(row) <= count]
         if len(remaining) == len(rows):
             return
         self._close()
@@ -117,13 +127,15 @@ class RunLogger:
         for name, value in row.items():
             if isinstance(value, list) and value and isinstance(value[0], list):
                 summary = _histogram(name, np.nansum(np.array(value, float), axis=0))
-            elif "/" in name and (mean := _mean(value)) is not None:
+            elif "/" in name and (mean := mean_of(value)) is not None:
                 summary = scalar(name, mean)
             else:
                 continue
-            event = Event(wall_time=row["time"], step=_count(row), summary=summary)
-            with writing(self._events_dir):
-                self._events.write(event.SerializeToString())
+            self._write_event(summary, count_of(row), row["time"])
+
+    def _write_event(self, summary: Any, step: int, seconds: float) -> None:
+        with writing(self._events_dir):
+            self._events.write(Event(wall_time=seconds, step=step, summary=summary).SerializeToString())
 
 
 def _histogram(name: str, counts: np.ndarray) -> Any:
@@ -136,11 +148,12 @@ def _histogram(name: str, counts: np.ndarray) -> Any:
     )  # fmt: skip
 
 
-def _count(row: Row) -> int:
+def count_of(row: Row) -> int:
+    """Return the ticks, or gradient steps, of a row."""
     return row["ticks"] if "ticks" in row else row["steps"]
 
 
-def _mean(value: Any) -> float | None:
+def mean_of(value: Any) -> float | None:
     """Return the mean over the finite seeds, or None without any."""
     numbers = [number for number in (value if isinstance(value, list) else [value]) if number is not None]
     return sum(numbers) / len(numbers) if numbers else None

@@ -56,9 +56,11 @@ def execute(command: Command) -> int:
     from taic_jax.pipeline import check_run
     from taic_jax.runtime.devices import open_devices
     from taic_jax.runtime.program_cache import keep_programs
+    from taic_jax.runtime.tracking import tracker_package
     from taic_jax.sweep.memory import points_that_fit
     from taic_jax.sweep.runs import TABLE, Plan, run_sweep, sweep_config
 
+    tracker_package(command.track)  # refuses first
     keep_programs()
     shard = "none" if command.pbt and command.shard == "auto" else command.shard
     shard = open_devices(shard, config.seeds * (len(points) or command.optuna))
@@ -77,7 +79,7 @@ def execute(command: Command) -> int:
         lambda signals: run_sweep(
             config, axes, plan, run_dir, resume=command.resume, overwrite=command.overwrite,
             on_cluster=bool(command.cluster), quiet=command.quiet, shard=shard, signals=signals,
-            checkpoint_seconds=command.checkpoint_seconds,
+            checkpoint_seconds=command.checkpoint_seconds, track=command.track,
         ),
         run_dir,
     )  # fmt: skip

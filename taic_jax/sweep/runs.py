@@ -13,13 +13,14 @@ import numpy as np
 
 from taic_jax.analysis.statistics import bootstrap_interval, iqm
 from taic_jax.artifacts.experience import EXPERIENCE
-from taic_jax.config import Config, replace
+from taic_jax.config import Config, Track, replace
 from taic_jax.config_io import to_yaml
 from taic_jax.pipeline import run_pipeline
 from taic_jax.runtime.files import save_json, save_table, save_text
 from taic_jax.runtime.pbt import Population, schedule
 from taic_jax.runtime.run_folder import LOCK, RunFolder, RunFolderError
 from taic_jax.runtime.signals import DivergedError
+from taic_jax.runtime.tracking import follow
 from taic_jax.sweep.axes import Axis, Point, chunks, configs_of, show
 from taic_jax.sweep.marginals import draw_marginals
 
@@ -62,6 +63,7 @@ def run_sweep(
     resume: bool = False,
     overwrite: bool = False,
     on_cluster: bool = False,
+    track: Track = "none",
     **settings: Any,
 ) -> None:
     """Run the missing chunks; write the table after each, and at the end the best point and the marginal plots.
@@ -79,7 +81,7 @@ def run_sweep(
             print(f"taic_jax: {run_dir} is finished: see {run_dir / TABLE}", file=sys.stderr)
             return
         table: list[TableRow] = []
-        work = partial(run_chunk, config, plan, run_dir)
+        work = partial(run_chunk, config, plan, run_dir, track)
         for batch in _batches(config, axes, plan, run_dir, table):
             for rows in _on_cluster(work, settings, batch) if on_cluster else map(partial(work, settings), batch):
                 table += rows
@@ -116,8 +118,10 @@ def _best_member(config: Config, plan: Plan, run_dir: Path) -> tuple[str, Point]
     return "".join(f"# {comment}\n" for comment in comments), last
 
 
-def run_chunk(config: Config, plan: Plan, run_dir: Path, settings: dict[str, Any], chunk: int) -> list[TableRow]:
-    """Run one chunk, unless it is finished, and return a row per point."""
+def run_chunk(
+    config: Config, plan: Plan, run_dir: Path, track: Track, settings: dict[str, Any], chunk: int
+) -> list[TableRow]:
+    """Run one chunk, unless it is finished, track its points, each as a run, and return a row per point."""
     folder, indices = RunFolder(run_dir / f"chunk-{chunk:03d}"), plan.chunks[chunk]
     points = configs_of(config, [plan.points[i] for i in indices])
     if not folder.finished:
@@ -126,6 +130,10 @@ def run_chunk(config: Config, plan: Plan, run_dir: Path, settings: dict[str, Any
         except DivergedError as error:
             print(f"taic_jax: {error}", file=sys.stderr)
             save_json(folder.summary_path, {"methods": {}})
+    for i, index in enumerate(indices):
+        part = slice(i * config.seeds, (i + 1) * config.seeds)
+        with follow(track, folder, points[i], f"{run_dir.name}-{index}", part):
+            pass  # the rows are there
     for name in (EXPERIENCE, "checkpoints"):  # only a resume needs them; a sweep killed here leaves some
         shutil.rmtree(folder.path / name, ignore_errors=True)
     if methods := folder.summary()["methods"]:

@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 
 from taic_jax import run
+from taic_jax.command_line import typed
 from taic_jax.envs import AutoReset, Env, TimeLimit, check_contract, custom, make_env
-from taic_jax.envs import __main__ as pictures
 from taic_jax.envs.custom import CustomEnvError, load_custom
 from taic_jax.envs.errors import UnknownNameError
+from taic_jax.handles import pictures
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / "experiments" / "examples"
@@ -229,20 +230,20 @@ def test_the_guide_holds_the_examples_word_for_word(path):
 
 
 def commands() -> list[str]:
-    lines = re.findall(r"^(python -m taic_jax.*)$", GUIDE, re.MULTILINE)
+    lines = re.findall(r"^((?:python -m taic_jax|taic ).*)$", GUIDE, re.MULTILINE)
     return [line.partition("#")[0].strip() for line in lines]
 
 
 @pytest.mark.parametrize("command", commands())
 def test_commands_of_the_guide_are_valid(command, monkeypatch):
     monkeypatch.chdir(ROOT)
-    _, _, module, *args = shlex.split(command)
-    if module == "taic_jax.run":
-        assert run.main([*args, "--dry-run"]) == 0
+    program, *args = shlex.split(command)
+    if program == "python":
+        assert args[1] == "taic_jax.run" and run.main([*args[2:], "--dry-run", "--quiet"]) == 0
     else:
-        assert module == "taic_jax.envs" and pictures.parse(args)
+        assert args[0] == "envs" and typed(args[1:], "", pictures.Arguments)
 
 
 def test_the_guide_has_commands_and_names_the_forms():
-    assert {"taic_jax.run", "taic_jax.envs"} <= {shlex.split(command)[2] for command in commands()}
+    assert {"taic_jax.run", "envs"} <= {word for command in commands() for word in shlex.split(command)}
     assert all(form in GUIDE for form in custom.FORMS.split(" or "))

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from taic_jax.command_line import typed
 from taic_jax.envs import RenderingError, environment_names, make_env, rendering
-from taic_jax.envs import __main__ as pictures
+from taic_jax.handles import pictures
 
 SIZE = (pictures.WIDTH, pictures.HEIGHT)
 
@@ -24,7 +25,7 @@ def in_empty_folder(tmp_path, monkeypatch):
 def draw(*args: str) -> list[str]:
     """Run the command, or skip where MuJoCo scenes cannot be drawn; return the files there are."""
     try:
-        pictures.draw(pictures.parse(args))
+        pictures.draw(typed(args, "", pictures.Arguments))
     except RenderingError as error:
         pytest.skip(str(error))
     return sorted(str(path) for path in Path().rglob("*.*"))
@@ -108,11 +109,11 @@ def test_the_animation_plays_in_real_time(tmp_path):
 REFUSED = {
     "unknown task": ("--tasks nav2d half_cheeta", "unknown environment 'half_cheeta': did you mean 'half_cheetah'?"),
     "unknown option": ("--task nav2d", "unknown option --task; the nearest is --tasks"),
-    "text for integer": ("--ticks many", "--ticks", "'--ticks many'"),
-    "no value": ("--out", "--out", "'--out'"),
-    "stray argument": ("nav2d", "got 'nav2d'"),
+    "text for integer": ("--ticks many", "--ticks: expected an integer", "got 'many'"),
+    "no value": ("--out", "--out: expected a value, got nothing"),
+    "stray argument": ("nav2d", "unexpected argument in 'nav2d'; expected options"),
     "no ticks": ("--ticks 0", "--ticks: expected at least 1, got 0; the nearest valid value is 1"),
-    "sheet's type": ("--contact-sheet all.jpeg", "expected a .png file, got all.jpeg; the nearest is all.jpeg.png"),
+    "sheet's type": ("--contact-sheet all.jpeg", "got all.jpeg; the nearest valid value is all.jpeg.png"),
     "file for folder": ("--out file --tasks nav2d", "file"),
 }
 
@@ -143,7 +144,7 @@ def test_errors_of_the_program_keep_their_traceback(monkeypatch):
 
 def test_the_module_runs_and_its_help_shows_every_argument():
     root = Path(pictures.__file__).parents[2]
-    command = [sys.executable, "-m", "taic_jax.envs", "--help"]
+    command = [sys.executable, "-m", "taic_jax", "envs", "--help"]
     done = subprocess.run(command, cwd=root, capture_output=True, text=True)
     assert done.returncode == 0 and done.stderr == ""
     for field in dataclasses.fields(pictures.Arguments):

@@ -1,6 +1,8 @@
 """The command `taic` on a finished run: evaluations and films that agree with it, and every mistake in one line."""
 
 import json
+import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -15,8 +17,11 @@ import taic_jax as taic
 from taic_jax.__main__ import COMMANDS, main
 from taic_jax.command_line import COMMON_FIELDS
 from taic_jax.config_io import preset_names
+from taic_jax.handles import assess, play
 from taic_jax.handles.play import MARK, with_label, with_options
 from taic_jax.run import PROGRAM
+from taic_jax.runtime.files import save_json
+from taic_jax.runtime.run_folder import RunFolder
 
 
 @pytest.fixture(scope="module")
@@ -43,6 +48,28 @@ def test_evaluate_measures_every_seed_as_the_function_does(run, tmp_path, monkey
             expected = [float(values[name]) for values in direct]
             np.testing.assert_allclose(told["methods"][method][name]["per_seed"], expected, rtol=1e-4)
     assert files_of(run) == before
+
+
+def test_a_seed_that_diverged_in_training_has_no_numbers(run, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "160")
+    lame, out = Path(shutil.copytree(run, tmp_path / "lame")), tmp_path / "evaluation.json"
+    summary = RunFolder(lame).summary()
+    summary["methods"]["taic"]["return"]["per_seed"][1] = None
+    save_json(RunFolder(lame).summary_path, summary)
+    assert main(["evaluate", str(lame), "--episodes", "1", "--out", str(out)]) == 0
+    results, table = json.loads(out.read_text())["methods"], capsys.readouterr().out
+    for values in results["taic"].values():
+        assert values["per_seed"][0] is not None and values["per_seed"][1] is values["mean"] is values["iqm"] is None
+    assert None not in results["flat"]["return"]["per_seed"]
+    assert "a seed diverged" in table and f"{results['flat']['return']['mean']:,.1f}" in table
+
+
+@pytest.mark.parametrize(("command", "work"), [("evaluate", (assess, "measure")), ("play", (play, "film"))])
+def test_a_folder_of_the_result_that_is_missing_is_refused_before_the_work(run, monkeypatch, capsys, command, work):
+    monkeypatch.setattr(*work, lambda *args: pytest.fail("the work was begun"))
+    assert main([command, str(run), "--out", "missing/a.webp"]) == 2
+    expected = "--out: expected a file in a folder that exists, got missing/a.webp; the nearest valid value is a.webp"
+    assert capsys.readouterr().err == f"taic_jax: error: {expected}\n" and not Path("missing").exists()
 
 
 def test_play_films_an_episode_of_methods_side_by_side(run, tmp_path, capsys):
@@ -108,7 +135,7 @@ def test_the_help_lists_every_command_and_each_has_its_own(capsys):
     assert main([]) == main(["--help"]) == 0
     out = capsys.readouterr().out
     assert all(f"  {name} " in out for name in COMMANDS)
-    for name in set(COMMANDS) - {"presets"}:
+    for name in set(COMMANDS) - {"presets", "completion"}:
         with pytest.raises(SystemExit) as stop:
             main([name, "--help"])
         assert stop.value.code == 0 and "--" in capsys.readouterr().out
@@ -122,14 +149,14 @@ def test_the_help_and_the_version_answer_without_jax():
     assert done.returncode == 0 and done.stdout.startswith(f"taic_jax {taic.__version__}\nusage: taic COMMAND")
 
 
-def test_presets_lists_each_with_its_task_and_its_purpose(capsys, monkeypatch):
+def test_presets_lists_each_with_its_task_its_purpose_and_its_minutes(capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "200")
     assert main(["presets"]) == 0
-    lines = [line.split(maxsplit=2) for line in capsys.readouterr().out.splitlines() if line.strip()]
-    assert {line[0] for line in lines[2:]} == set(preset_names())
-    assert ["transfer_ant_maze", "ant_maze", "Ant's options in the maze"] in [
-        [x.strip() for x in line] for line in lines
-    ]
+    header, _, *lines = [line.split(maxsplit=2) for line in capsys.readouterr().out.splitlines() if line.strip()]
+    assert {line[0] for line in lines} == set(preset_names()) and "by --dry-run" in header[2]
+    assert all(re.fullmatch(r".*  about \d+(\.\d+)?", line[2].strip()) for line in lines)
+    (maze,) = (line for line in lines if line[0] == "transfer_ant_maze")
+    assert maze[1] == "ant_maze" and maze[2].startswith("Ant's options in the maze")
 
 
 def test_the_short_help_shows_the_options_of_the_command_and_the_common_fields(capsys):

@@ -94,7 +94,7 @@ def test_where_nothing_can_be_written_nothing_is_begun(capsys, limit):
     finally:
         limit(None)
     assert Path("file").read_bytes() == b"" and no_leftovers(Path())
-    assert main(["config.yaml", "--run-dir", "new", "--dry-run"]) == 0
+    assert main(["config.yaml", "--run-dir", "new", "--dry-run", "--quiet"]) == 0
 
 
 def test_a_read_only_run_is_not_resumed(whole, monkeypatch, capfd):

@@ -1,10 +1,13 @@
 """What a run measures: rows, events and their agreement after a resume."""
 
+import io
 import json
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from PIL import Image
 from tensorboardX.proto.event_pb2 import Event  # pyright: ignore[reportAttributeAccessIssue]
 from tensorboardX.proto.summary_pb2 import HistogramProto  # pyright: ignore[reportAttributeAccessIssue]
 
@@ -22,20 +25,30 @@ def read_histograms(run_dir) -> dict[tuple[str, int], HistogramProto]:
     return _read_events(run_dir)[1]
 
 
-def _read_events(run_dir) -> tuple[dict, dict]:
+def _read_events(run_dir) -> tuple[dict, dict, dict]:
     """Read all events: a record is 8 bytes of length, 4 of checksum, the event, 4 of checksum."""
-    scalars, histograms = {}, {}
+    scalars, histograms, images = {}, {}, {}
     for path in (run_dir / "tensorboard").iterdir():
         data = path.read_bytes()
         while data:
             end = 12 + int.from_bytes(data[:8], "little")
             event = Event.FromString(data[12:end])
             for value in event.summary.value:
-                seen = histograms if value.HasField("histo") else scalars
-                assert (value.tag, event.step) not in seen
-                seen[value.tag, event.step] = value.histo if seen is histograms else value.simple_value
+                place = value.tag, event.step
+                assert place not in {**scalars, **histograms, **images}
+                if value.HasField("image"):
+                    images[place] = value.image
+                elif value.HasField("histo"):
+                    histograms[place] = value.histo
+                else:
+                    scalars[place] = value.simple_value
             data = data[end + 4 :]
-    return scalars, histograms
+    return scalars, histograms, images
+
+
+def read_images(run_dir) -> dict[tuple[str, int], Any]:
+    """Read all pictures."""
+    return _read_events(run_dir)[2]
 
 
 def test_rows_hold_one_number_per_seed_and_events_their_mean(tmp_path):
@@ -153,3 +166,16 @@ def test_a_half_written_row_is_dropped(tmp_path):
     with RunLogger(tmp_path) as logger:
         logger.log("train", 40, {})
     assert [row["ticks"] for row in RunFolder(tmp_path).metrics()] == [10, 20, 30, 10, 20, 30, 40]
+
+
+def test_an_animation_is_an_image_that_plays(tmp_path):
+    frames = np.zeros((3, 32, 48, 3), np.uint8)
+    frames[1:] = 250
+    with RunLogger(tmp_path) as logger:
+        logger.log("train", 8, {"return": 1.0})
+        logger.show("video", 64, frames, dt=0.2)
+    image = read_images(tmp_path)["video", 64]
+    assert (image.height, image.width, image.colorspace) == (32, 48, 3) and len(read_images(tmp_path)) == 1
+    with Image.open(io.BytesIO(image.encoded_image_string)) as gif:
+        assert gif.format == "GIF" and gif.size == (48, 32) and gif.info["duration"] == 200 and gif.n_frames > 1
+    assert read_events(tmp_path) == {("train/return", 8): 1.0}

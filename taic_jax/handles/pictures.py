@@ -1,15 +1,8 @@
-"""Draw every task: a picture and a short animation of each, and one sheet of them all.
+"""Draw every task: a picture and a short animation of each, and one sheet of them all: `taic envs`."""
 
-python -m taic_jax.envs --out pictures --contact-sheet pictures/all.png
-"""
-
-import contextlib
 import dataclasses
-import io
 import math
-import os
 import re
-import sys
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,11 +15,12 @@ from jax import Array
 from jaxtyping import Key, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
-from taic_jax.envs import AutoReset, Env, RenderingError, State, environment_names, make_env
-from taic_jax.envs.errors import nearest
+from taic_jax.command_line import tell, typed
+from taic_jax.config import impossible
+from taic_jax.envs import AutoReset, Env, State, environment_names, make_env
 from taic_jax.envs.rendering import write_webp
 
-PROGRAM = "python -m taic_jax.envs"
+PROGRAM = "taic envs"
 HEIGHT, WIDTH = 300, 400  # pixels of every picture
 GAP, CAPTION = 20, 36  # pixels between the tiles of the sheet, and below each for its name
 INK, PAPER, FRAME = "#3d4451", "#ffffff", "#c9ccd2"
@@ -47,51 +41,18 @@ class Arguments:
     ticks: int = 100  # Length of the animations.
 
 
-class ArgumentError(ValueError):
-    """A mistake in the arguments; the message is one line."""
-
-
-def main(args: Sequence[str] | None = None) -> int:
+def main(args: Sequence[str]) -> int:
     """Draw, and return the exit code: 0, or 2 for a mistake of the user or a machine that cannot draw."""
-    try:
-        draw(parse(sys.argv[1:] if args is None else args))
-    except BrokenPipeError:  # the reader, such as head, has stopped
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    except (ValueError, OSError, RenderingError) as error:
-        ours = type(error).__module__.partition(".")[0] in ("taic_jax", __name__)
-        if not ours and not isinstance(error, OSError):
-            raise
-        print("taic_jax: error:", " ".join(str(error).split()), file=sys.stderr)
-        return 2
-    return 0
-
-
-def parse(args: Sequence[str]) -> Arguments:
-    """Parse the arguments; raise `ArgumentError` if one is not valid."""
-    try:
-        with contextlib.redirect_stderr(io.StringIO()):
-            arguments = tyro.cli(Arguments, prog=PROGRAM, args=args)
-    except SystemExit as stop:
-        if not stop.code:
-            raise
-        names = ["--" + field.name.replace("_", "-") for field in dataclasses.fields(Arguments)]
-        valid = ", ".join(names)
-        for option in (arg.partition("=")[0] for arg in args if arg.startswith("--")):
-            if option.replace("_", "-") not in names:
-                similar = nearest(option, names, cutoff=0.6)
-                hint = f"the nearest is {similar}" if similar else f"there are {valid}"
-                raise ArgumentError(f"unknown option {option}; {hint}") from None
-        raise ArgumentError(f"expected {valid} with their values, got {' '.join(args)!r}") from None
-    if arguments.ticks < 1:
-        raise ArgumentError(f"--ticks: expected at least 1, got {arguments.ticks}; the nearest valid value is 1")
-    sheet = arguments.contact_sheet
-    if sheet and sheet.suffix.lower() != ".png":
-        raise ArgumentError(f"--contact-sheet: expected a .png file, got {sheet}; the nearest is {sheet}.png")
-    return arguments
+    return tell(lambda: draw(typed(args, PROGRAM, Arguments)))
 
 
 def draw(arguments: Arguments) -> None:
     """Write the pictures, and print the path of each; raise at a wrong name before any is written."""
+    if arguments.ticks < 1:
+        raise impossible("--ticks", arguments.ticks, "at least 1", 1)
+    sheet = arguments.contact_sheet
+    if sheet and sheet.suffix.lower() != ".png":
+        raise impossible("--contact-sheet", sheet, "a .png file", f"{sheet}.png")
     envs = [make_env(name) for name in arguments.tasks or environment_names()]
     arguments.out.mkdir(parents=True, exist_ok=True)
     tiles = {}
@@ -105,10 +66,10 @@ def draw(arguments: Arguments) -> None:
         Image.fromarray(tiles[env.name]).save(picture)
         write_webp(film, frames, env.dt)
         print(picture, film, sep="\n", flush=True)
-    if arguments.contact_sheet:
-        arguments.contact_sheet.parent.mkdir(parents=True, exist_ok=True)
-        contact_sheet(tiles).save(arguments.contact_sheet)
-        print(arguments.contact_sheet)
+    if sheet:
+        sheet.parent.mkdir(parents=True, exist_ok=True)
+        contact_sheet(tiles).save(sheet)
+        print(sheet)
 
 
 def random_episodes(env: Env, key: Key[Array, ""], ticks: int) -> State:
@@ -155,7 +116,3 @@ def contact_sheet(tiles: dict[str, UInt8[np.ndarray, "height width 3"]]) -> Imag
         brush.rectangle((x - 1, y - 1, x + width, y + height), outline=FRAME, width=2)
         brush.text((x + width / 2, y + height + CAPTION / 2), name, INK, font, anchor="mm")
     return sheet
-
-
-if __name__ == "__main__":
-    sys.exit(main())
