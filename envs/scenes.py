@@ -17,6 +17,8 @@ from taic_jax.envs.wrappers import Wrapper
 Scene = tuple[mujoco.MjModel, Callable[[Any], Any]]
 """A model, and the function from `State.physics` to its poses [..., nq]."""
 
+PLANE = mujoco.mjtGeom.mjGEOM_PLANE
+
 
 def make_scene(env: Env) -> Scene | None:
     """Return the scene of a task of ours, of Brax or of Playground; None for others, whose model is not known."""
@@ -31,6 +33,17 @@ def make_scene(env: Env) -> Scene | None:
             return env.inner.sys.mj_model, attrgetter("simulation.q")
         case PlaygroundEnv():
             return env.inner.mj_model, attrgetter("simulation.qpos")
+
+
+def place_bodies(model: mujoco.MjModel, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return positions [T, N, bodies, 3] and quaternions [T, N, bodies, 4] of all bodies in poses [T, N, nq]."""
+    data, shape = mujoco.MjData(model), (*poses.shape[:2], model.nbody)
+    places, turns = np.zeros((*shape, 3), np.float32), np.zeros((*shape, 4), np.float32)
+    for row in np.ndindex(shape[:2]):
+        data.qpos[:] = poses[row]
+        mujoco.mj_kinematics(model, data)
+        places[row], turns[row] = data.xpos, data.xquat
+    return places, turns
 
 
 def _room(env: Navigation) -> mujoco.MjModel:

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-PARTS = ("analysis", "artifacts", "options", "report", "rl", "runtime", "sweep")
+PARTS = ("analysis", "artifacts", "handles", "options", "report", "rl", "runtime", "sweep")
 FOLDERS = ("envs", "experiments", *(f"taic_jax/{name}" for name in PARTS))
 PACKAGE = sorted((ROOT / "taic_jax").glob("*.py")) + sorted(
     path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py")
@@ -41,7 +41,12 @@ FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 
 
 def module_name(path: Path) -> str:
-    """Return the module's own name within the package: envs/base.py is envs, taic_jax/rl/ppo.py is rl."""
+    """Return the module's own name within the package: envs/base.py is envs, taic_jax/rl/ppo.py is rl.
+
+    A command line, `__main__.py` in any folder, is in the last layer, and nothing imports it.
+    """
+    if path.stem == "__main__":
+        return path.stem
     parts = path.relative_to(ROOT).with_suffix("").parts
     return parts[1] if parts[0] == "taic_jax" else parts[0]
 

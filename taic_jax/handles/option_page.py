@@ -7,7 +7,6 @@ from functools import partial
 from typing import Any
 
 import jax
-import mujoco
 import numpy as np
 from matplotlib import colormaps
 from mjviser.conversions import merge_geoms
@@ -17,7 +16,7 @@ from viser import ViserServer
 from taic_jax.analysis.measures import standardized
 from taic_jax.analysis.option_space import replay
 from taic_jax.envs.base import Env
-from taic_jax.envs.scenes import Scene
+from taic_jax.envs.scenes import PLANE, Scene, place_bodies
 from taic_jax.envs.wrappers import AutoReset
 from taic_jax.options.execution import Executor
 
@@ -98,12 +97,7 @@ class OptionPage:
 
     def _place(self, poses: np.ndarray) -> None:
         """Hold positions [T, N, bodies, 3] and quaternions [T, N, bodies, 4] of all bodies in poses [T, N, nq]."""
-        data, shape = mujoco.MjData(self.model), (*poses.shape[:2], self.model.nbody)
-        self.places, self.turns = np.zeros((*shape, 3), np.float32), np.zeros((*shape, 4), np.float32)
-        for row in np.ndindex(shape[:2]):
-            data.qpos[:] = poses[row]
-            mujoco.mj_kinematics(self.model, data)
-            self.places[row], self.turns[row] = data.xpos, data.xquat
+        self.places, self.turns = place_bodies(self.model, poses)
         if self.bare:  # ground alone looks alike everywhere: the robot begins in the middle of the view
             self.places[..., :2] -= self.places[0, 0, next(iter(self.meshes)), :2]
 
@@ -111,7 +105,7 @@ class OptionPage:
         """Draw the world, and give each body that moves a mesh of GHOSTS + 1 instances."""
         scene, model, camera = self.server.scene, self.model, self.server.initial_camera
         camera.position, camera.look_at = model.stat.center + model.stat.extent * VIEW, model.stat.center
-        shown, planes = model.geom_group < 3, model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
+        shown, planes = model.geom_group < 3, model.geom_type == PLANE
         for geom in np.flatnonzero(shown & planes):
             width, height, _ = 2 * model.geom_size[geom]
             scene.add_grid(f"/plane{geom}", width, height, position=model.geom_pos[geom], fade_distance=40.0)

@@ -3,6 +3,7 @@
 import dataclasses
 import math
 import re
+import sys
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
@@ -41,9 +42,9 @@ class Arguments:
     ticks: int = 100  # Length of the animations.
 
 
-def main(args: Sequence[str]) -> int:
+def main(args: Sequence[str] | None = None) -> int:
     """Draw, and return the exit code: 0, or 2 for a mistake of the user or a machine that cannot draw."""
-    return tell(lambda: draw(typed(args, PROGRAM, Arguments)))
+    return tell(lambda: draw(typed(sys.argv[1:] if args is None else args, PROGRAM, Arguments)))
 
 
 def draw(arguments: Arguments) -> None:
