@@ -13,6 +13,7 @@ COMMANDS = {
     "sweep": "train at many points of the config, several in one program",
     "play": "film the agents of a finished run",
     "evaluate": "evaluate them anew: other episodes, tasks, noise",
+    "export": "write an agent as StableHLO, ONNX or NumPy's arrays, for other programs",
     "report": "write one HTML page about runs and sweeps",
     "presets": "list the configs that ship with the package",
     "envs": "draw every task",
@@ -39,6 +40,8 @@ def main(args: Sequence[str] | None = None) -> int:
             from taic_jax.handles.play import main as command
         case "evaluate":
             from taic_jax.handles.assess import main as command
+        case "export":
+            from taic_jax.handles.export import main as command
         case "report":
             from taic_jax.report.__main__ import main as command
         case "presets":
