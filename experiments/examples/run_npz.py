@@ -1,4 +1,4 @@
-"""Run flat PPO or closed-loop options of `taic export --format npz` in Gymnasium: python run_npz.py FOLDER [ENV]."""
+"""Run an agent of `taic export --format npz` in Gymnasium with NumPy alone: python run_npz.py FOLDER [ENV]."""
 
 import json
 import sys
@@ -10,31 +10,70 @@ import numpy as np
 folder, name = [*sys.argv[1:], "HalfCheetah-v5"][:2]
 about = json.loads(Path(folder, "agent.json").read_text())
 x = dict(np.load(Path(folder, "agent.npz")))
-if about["decoder"] == "open" or about["termination"] == "predict":
-    sys.exit("this runner has no LSTM: neither open-loop options nor termination predict")
+D, E = (f"executor.model.params.{network}.params." for network in ("decoder", "encoder"))
 
 
-def mlp(network, value):
-    """Return the output of a network."""
-    for i, layer in enumerate(about["layers"][network]):
-        value = (np.tanh(value) if i else value) @ x[f"{layer}.kernel"] + x[f"{layer}.bias"]
+def dense(layer, value):
+    """Return the output of a linear layer."""
+    return value @ x[f"{layer}.kernel"] + x[f"{layer}.bias"]
+
+
+def mlp(network, *values):
+    """Return the output of linear layers with tanh between them."""
+    first, *layers = about["layers"][network]
+    value = dense(first, np.concatenate(values))
+    for layer in layers:
+        value = dense(layer, np.tanh(value))
     return value
+
+
+def lstm(cell, carry, value):
+    """Return the next carry of an LSTM, memory and output."""
+    i, f, g, o = (value @ x[f"{cell}.i{gate}.kernel"] + dense(f"{cell}.h{gate}", carry[1]) for gate in "ifgo")
+    i, f, o = (1 / (1 + np.exp(-gate)) for gate in (i, f, o))
+    memory = f * carry[0] + i * np.tanh(g)
+    return memory, o * np.tanh(memory)
+
+
+def scaled(scale, value):
+    """Return a value in standard deviations from the mean."""
+    return (value - x[f"{scale}.mean"]) / x[f"{scale}.std"]
+
+
+def ended():
+    """Return whether the option ends by its rule: D's end signal, or P surprised by the state, given E's code."""
+    if about["termination"] == "predict":
+        code = dense(E + "head", read[1])[: len(option)]
+        change = mlp("predictor", scaled("executor.model.state_scale", first), code)
+        error = np.mean((change - scaled("executor.model.change_scale", state - first)) ** 2)
+        return error >= x["executor.model.delta"]
+    return about["termination"] == "output" and logit > 0
 
 
 env = gymnasium.wrappers.RescaleAction(gymnasium.make(name), *about["actions"])
 for seed in range(10):
     obs, _ = env.reset(seed=seed)
-    duration, logit, total, ended = about["length"], -1.0, 0.0, False
-    while not ended:
-        if duration == about["length"] or (about["termination"] == "output" and logit > 0):
-            seen = (obs - x["obs_statistics.mean"]) / x["obs_statistics.std"]
-            option, duration = mlp("actor", np.clip(seen, -about["clip"], about["clip"])), 0
+    duration, total, done = 0, 0.0, False
+    while not done:
+        state = obs[: about["proprioceptive_size"]]
+        if duration in (0, about["length"]) or ended():
+            seen = np.clip(scaled("obs_statistics", obs), -about["clip"], about["clip"])
+            option, duration, first = mlp("actor", seen), 0, state
+            if about["decoder"] == "open":
+                carry = np.split(np.tanh(dense(D + "first", option)), 2)
+            if about["termination"] == "predict":
+                read = np.zeros((2, *x[E + "cell.hf.bias"].shape))
         action = option
-        if about["decoder"]:
-            state = obs[: about["proprioceptive_size"]] - x["executor.model.state_scale.mean"]
-            state = state / x["executor.model.state_scale.std"]
-            *action, logit = mlp("decoder", np.concatenate([state, option, [duration / about["length"]]]))
+        if about["decoder"] == "open":
+            carry = lstm(D + "cell", carry, option)
+            *action, logit = dense(D + "head", carry[1])
+        elif about["decoder"] == "closed":
+            share = [duration / about["length"]]
+            *action, logit = mlp("decoder", scaled("executor.model.state_scale", state), option, share)
+        action = np.clip(action, -1, 1).astype(np.float32)
+        if about["termination"] == "predict":
+            read = lstm(E + "cell", read, action)
         duration += 1
-        obs, reward, terminated, truncated, _ = env.step(np.clip(action, -1, 1).astype(np.float32))
-        total, ended = total + float(reward), terminated or truncated
+        obs, reward, terminated, truncated, _ = env.step(action)
+        total, done = total + float(reward), terminated or truncated
     print(f"return {total:.3f}")
