@@ -85,8 +85,10 @@ def methods_of(command: Command, handle: "Handle", default: Sequence[str] = ()) 
 def agent_of(handle: "Handle", method: str, option: str, seed: int = 0) -> "Agent":
     """Return the agent of a method, as named by a command line's `option`, and of a seed, or raise ConfigError."""
     if method not in handle.agents:
-        expected = ", ".join(handle.agents) or "a run with agents, as this one has option models alone"
-        raise ConfigError(f"{option}: expected some of {expected}, got {method}{nearest(method, handle.agents)}")
+        if not handle.agents:
+            raise ConfigError(f"{option}: expected a run with agents, this has option models alone")
+        expected = f"some of {', '.join(handle.agents)}"
+        raise ConfigError(f"{option}: expected {expected}, got {method}{nearest(method, handle.agents)}")
     last = len(handle.agents[method]) - 1
     if not 0 <= seed <= last:
         raise impossible("--seed", seed, f"0 to {last}", min(max(seed, 0), last))

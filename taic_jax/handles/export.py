@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from taic_jax import __version__
-from taic_jax.config import TAIC
+from taic_jax.config import TAIC, ConfigError
 from taic_jax.handles.command import OnRun, agent_of, answer
 
 if TYPE_CHECKING:
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 PROGRAM = "taic export"
 FORMAT = 1  # of the files
+ABOUT, FILES = "agent.json", {"jax": "agent.stablehlo", "onnx": "agent.onnx", "npz": "agent.npz"}
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,7 @@ class Command(OnRun):
     seed: int = 0
     """Seed of the run whose agent is exported, counted from 0."""
     out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("export")
-    """Folder for agent.json and agent.stablehlo, agent.onnx or agent.npz."""
+    """Folder for agent.json and agent.stablehlo, agent.onnx or agent.npz, in place of an earlier export."""
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -45,6 +46,8 @@ def execute(command: Command, handle: "Handle") -> None:
     from taic_jax.handles.tick import export
     from taic_jax.runtime.files import atomic_file, save_json, writing
 
+    if not command.format:
+        raise ConfigError(f"--format: expected some of {', '.join(FILES)}, got none")
     files, function = export(agent_of(handle, command.method, "--method", command.seed), command.format)
     options = handle.config.options if command.method == TAIC else None
     about = {
@@ -53,15 +56,15 @@ def execute(command: Command, handle: "Handle") -> None:
         "decoder": options and options.decoder, "termination": options and options.termination,
         "crc32": {name: zlib.crc32(content) for name, content in files.items()},
     }  # fmt: skip
-    path = command.out / "agent.json"
     with writing(command.out):
         command.out.mkdir(parents=True, exist_ok=True)
-        path.unlink(missing_ok=True)  # until the files that it describes are whole
+        for name in (ABOUT, *FILES.values()):  # those of an earlier export: none is described by another's agent.json
+            (command.out / name).unlink(missing_ok=True)
     for name, content in files.items():
         with atomic_file(command.out / name) as file:
             file.write(content)
-    save_json(path, about)
-    print(*(command.out / name for name in files), path, sep="\n")
+    save_json(command.out / ABOUT, about)
+    print(*(command.out / name for name in (*files, ABOUT)), sep="\n")
 
 
 if __name__ == "__main__":
