@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 PROGRAM = "taic export"
 FORMAT = 1  # of the files
-ABOUT, FILES = "agent.json", {"jax": "agent.stablehlo", "onnx": "agent.onnx", "npz": "agent.npz"}
+ABOUT = "agent.json"
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ def main(args: Sequence[str] | None = None) -> int:
 def execute(command: Command, handle: "Handle") -> None:
     """Write the files, once all are known, and print their paths."""
     from taic_jax.artifacts.models import describe
-    from taic_jax.handles.tick import export
+    from taic_jax.handles.tick import FILES, export
     from taic_jax.runtime.files import atomic_file, save_json, writing
 
     if not command.format:

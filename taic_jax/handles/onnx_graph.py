@@ -1,4 +1,8 @@
-"""A traced function as an ONNX graph: a node or two for each primitive that the tick of an agent uses."""
+"""A traced function as an ONNX graph: a node or two for each primitive that the tick of an agent uses.
+
+The package jax2onnx would do the same, but its 0.17 cannot be installed beside this one: it needs orbax-checkpoint
+before 0.11.37, checkpoints here need 0.12.
+"""
 
 from collections.abc import Callable, Sequence
 from typing import Any

@@ -17,6 +17,7 @@ from taic_jax.rl.agent import Agent, advance
 from taic_jax.rl.normalize import CLIP
 from taic_jax.runtime.checkpoint import plain_arrays
 
+FILES = {"jax": "agent.stablehlo", "onnx": "agent.onnx", "npz": "agent.npz"}
 NETWORKS = ("actor", "decoder", "encoder", "predictor")
 IDLE = {"critic", "log_std", "count", "summed_variance", "estimator"}  # parts of an agent without a part in acting
 
@@ -51,16 +52,16 @@ def export(agent: Agent, formats: Sequence[str]) -> tuple[dict[str, bytes], dict
     arrays: dict[str, Any] = {name: x for name, x in plain_arrays(agent).items() if not IDLE & set(name.split("."))}
     if "jax" in formats:
         function = jax.export.export(jax.jit(tick), platforms=("cpu", "cuda"))(*inputs.values())
-        files["agent.stablehlo"] = bytes(function.serialize())
+        files[FILES["jax"]] = bytes(function.serialize())
     if "onnx" in formats:
         try:
             from taic_jax.handles.onnx_graph import to_onnx
         except ModuleNotFoundError:
             raise MissingExtraError("onnx", "onnx") from None
-        files["agent.onnx"] = to_onnx(tick, inputs, ["action", *(f"next.{name}" for name in [*inputs][1:])])
+        files[FILES["onnx"]] = to_onnx(tick, inputs, ["action", *(f"next.{name}" for name in [*inputs][1:])])
     if "npz" in formats:
         np.savez(buffer := io.BytesIO(), **arrays)
-        files["agent.npz"] = buffer.getvalue()
+        files[FILES["npz"]] = buffer.getvalue()
     carry = [{"name": name, "shape": x.shape, "dtype": x.dtype.name, "start": 0} for name, x in inputs.items()][1:]
     layers = {x: {name.rpartition(".")[0] for name in arrays if f".{x}." in name} for x in NETWORKS}
     ordered = {x: sorted(names, key=lambda name: (len(name), name)) for x, names in layers.items()}
