@@ -60,9 +60,10 @@ class _Graph:
         names = dict(zip(jaxpr.invars, inputs, strict=True))
 
         def name(x: Any) -> str:
+            aval: Any = x.aval
             if isinstance(x, Literal):
-                return self.constant(x.val, x.aval.dtype)
-            return names[x] if x in names else names.setdefault(x, self.constant(constants[x], x.aval.dtype))
+                return self.constant(x.val, aval.dtype)
+            return names[x] if x in names else names.setdefault(x, self.constant(constants[x], aval.dtype))
 
         for equation in jaxpr.eqns:
             names |= zip(equation.outvars, self.node(equation, [*map(name, equation.invars)]), strict=True)
