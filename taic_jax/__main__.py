@@ -14,6 +14,7 @@ COMMANDS = {
     "play": "film the agents of a finished run",
     "evaluate": "evaluate them anew: other episodes, tasks, noise",
     "explore": "move through the options of a run in the browser",
+    "export": "write an agent as StableHLO, ONNX or NumPy's arrays, for other programs",
     "report": "write one HTML page about runs and sweeps",
     "presets": "list the configs that ship with the package",
     "envs": "draw every task",
@@ -43,6 +44,8 @@ def main(args: Sequence[str] | None = None) -> int:
             from taic_jax.handles.assess import main as command
         case "explore":
             from taic_jax.handles.explore import main as command
+        case "export":
+            from taic_jax.handles.export import main as command
         case "report":
             from taic_jax.report.__main__ import main as command
         case "presets":

@@ -4,7 +4,7 @@ import dataclasses
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import tyro
 
@@ -14,22 +14,29 @@ from taic_jax.config_io import nearest, validate
 
 if TYPE_CHECKING:  # it imports JAX, without which the command lines answer
     from taic_jax.handles.load import Handle
+    from taic_jax.rl.agent import Agent
 
 
 @dataclass(frozen=True)
-class Source:
+class OnRun:
     """Arguments of a command on a finished run."""
 
     run: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="RUN")] = ""
-    """Folder of a finished run, or of the agents of a method in it."""
+    """Folder of a finished run, or of the agents of a method in it, or pretrained:NAME."""
+
+
+@dataclass(frozen=True)
+class OnTask(OnRun):
+    """Arguments of a command that simulates a task, by default that of the run."""
+
     key: int = 0
     """Seed of the PRNG key that the episodes are drawn with."""
     env: Annotated[EnvConfig, tyro.conf.FlagConversionOff] = EnvConfig()
 
 
 @dataclass(frozen=True)
-class Command(Source):
-    """Arguments of a command on the agents of a finished run."""
+class Command(OnTask):
+    """Arguments of a command that lets the agents of a finished run act."""
 
     methods: tuple[str, ...] = ()
     """Methods by name, such as taic and flat; none takes those that the command is for."""
@@ -37,7 +44,7 @@ class Command(Source):
     """Act with the noise of training, in place of the mean options or actions."""
 
 
-C = TypeVar("C", bound=Source)
+C = TypeVar("C", bound=OnRun)
 
 
 def answer(args: Sequence[str] | None, program: str, kind: type[C], execute: Callable[[C, "Handle"], object]) -> int:
@@ -54,10 +61,12 @@ def answer(args: Sequence[str] | None, program: str, kind: type[C], execute: Cal
 
         keep_programs()
         handle = load(args[0])
-        command = typed(args, program, kind, default=kind(args[0], env=handle.config.env))
-        config = dataclasses.replace(handle.config, env=command.env)
-        validate(config)
-        execute(command, dataclasses.replace(handle, config=config))
+        own: dict[str, Any] = {"env": handle.config.env} if issubclass(kind, OnTask) else {}
+        command = typed(args, program, kind, default=kind(args[0], **own))
+        if isinstance(command, OnTask):
+            handle = dataclasses.replace(handle, config=dataclasses.replace(handle.config, env=command.env))
+            validate(handle.config)
+        execute(command, handle)
 
     return tell(work)
 
@@ -70,13 +79,23 @@ def methods_of(command: Command, handle: "Handle", default: Sequence[str] = ()) 
     if not methods:
         raise ConfigError(f"RUN: expected agents, got {command.run}, which has option models alone")
     for name in methods:
-        if name not in handle.agents:
-            expected = f"some of {', '.join(handle.agents)}"
-            raise ConfigError(f"--methods: expected {expected}, got {name}{nearest(name, handle.agents)}")
-        agent = handle.agents[name][0]
+        agent = agent_of(handle, name, "--methods")
         sizes = [agent.observation_size, agent.action_size]
         if sizes != [env.observation_size, env.action_size]:
             expected = f"a task with {sizes[0]} observations and {sizes[1]} actions, as {name} was trained for"
             got = f"{env.name} with {env.observation_size} and {env.action_size}"
             raise impossible("--env.name", got, expected)
     return methods
+
+
+def agent_of(handle: "Handle", method: str, option: str, seed: int = 0) -> "Agent":
+    """Return the agent of a method, as named by a command line's `option`, and of a seed, or raise ConfigError."""
+    if method not in handle.agents:
+        if not handle.agents:
+            raise ConfigError(f"{option}: expected a run with agents, this has option models alone")
+        expected = f"some of {', '.join(handle.agents)}"
+        raise ConfigError(f"{option}: expected {expected}, got {method}{nearest(method, handle.agents)}")
+    last = len(handle.agents[method]) - 1
+    if not 0 <= seed <= last:
+        raise impossible("--seed", seed, f"0 to {last}", min(max(seed, 0), last))
+    return handle.agents[method][seed]

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Sequence
 
 from taic_jax.config import ConfigError, field_types
 from taic_jax.config_io import nearest, preset_names
-from taic_jax.handles import assess, explore, pictures, play
+from taic_jax.handles import assess, explore, export, pictures, play
 
 BASH = """_taic() {
   local words
@@ -26,7 +26,7 @@ def complete(args: Sequence[str], commands: Iterable[str], later: dict[str, type
     if shell not in SHELLS:
         raise ConfigError(f"taic completion: expected one of {', '.join(SHELLS)}, got {shell}{nearest(shell, SHELLS)}")
     kinds = later | {"play": play.Command, "evaluate": assess.Command, "envs": pictures.Arguments}
-    kinds["explore"] = explore.Command
+    kinds |= {"explore": explore.Command, "export": export.Command}
     presets, cases, every = " ".join(preset_names()), [], set()
     for name, kind in kinds.items():
         fields = [x.removeprefix("config.") for x in field_types(kind) if x not in ("source", "run", "runs")]

@@ -17,7 +17,7 @@ PROGRAM = "taic explore"
 
 
 @dataclass(frozen=True)
-class Command(command.Source):
+class Command(command.OnTask):
     """Serve a page that executes options by their codes, with ghosts, paths between two codes, and a map."""
 
     seed: int = 0

@@ -11,7 +11,7 @@ from PIL import Image, ImageDraw
 
 from taic_jax.config import METHOD_LABELS, TAIC, impossible
 from taic_jax.handles import command
-from taic_jax.handles.command import answer, methods_of
+from taic_jax.handles.command import agent_of, answer, methods_of
 
 if TYPE_CHECKING:
     from taic_jax.handles.load import Handle
@@ -41,9 +41,7 @@ def main(args: Sequence[str]) -> int:
 def execute(command: Command, handle: "Handle") -> None:
     """Film, write the file and print its path and the returns."""
     methods = methods_of(command, handle, (TAIC,))
-    last = len(handle.agents[methods[0]]) - 1
-    if not 0 <= command.seed <= last:
-        raise impossible("--seed", command.seed, f"0 to {last}", min(max(command.seed, 0), last))
+    agent_of(handle, methods[0], "--methods", command.seed)
     if command.ticks < 0:
         raise impossible("--ticks", command.ticks, "at least 0", 0)
     from taic_jax.envs.rendering import check_film, write_film

@@ -17,7 +17,7 @@ Statistics = running_statistics.RunningStatisticsState
 """Mean and standard deviation of all data so far, with a 64-bit count."""
 
 
-CARRIED = 1000
+CARRIED, CLIP = 1000, 10.0
 
 
 def init(shape: tuple[int, ...] = ()) -> Statistics:
@@ -46,7 +46,7 @@ def update(statistics: Statistics, batch: Float[Array, "..."]) -> Statistics:
         return running_statistics.update(statistics, batch, validate_shapes=False)
 
 
-def normalize(statistics: Statistics, x: Float[Array, "..."], clip: float = 10.0) -> Float[Array, "..."]:
+def normalize(statistics: Statistics, x: Float[Array, "..."], clip: float = CLIP) -> Float[Array, "..."]:
     """Return (x - mean) / std, clipped to `clip` standard deviations."""
     mean: Any = statistics.mean
     std: Any = statistics.std
