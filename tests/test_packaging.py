@@ -84,6 +84,8 @@ def shipped() -> set[str]:
         for path in (*ROOT.glob(f"{folder}/**/*.py"), *ROOT.glob(f"{folder}/**/*.yaml")):
             files.add("taic_jax/" + path.relative_to(ROOT).as_posix())
     files.add("taic_jax/experiments/results/presets.csv")
+    pretrained = (path for path in ROOT.glob("experiments/pretrained/**/*") if path.is_file())
+    files |= {f"taic_jax/{path.relative_to(ROOT).as_posix()}" for path in pretrained}
     page = [path for ending in ("html", "css", "js") for path in ROOT.glob(f"taic_jax/report/*.{ending}")]
     return files | {"taic_jax/py.typed"} | {path.relative_to(ROOT).as_posix() for path in page}
 
