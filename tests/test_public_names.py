@@ -15,6 +15,8 @@ import contextlib, importlib, pkgutil
 import taic_jax as taic
 first = {name: getattr(taic, name) for name in taic.__all__}
 for module in pkgutil.walk_packages(taic.__path__, "taic_jax."):
+    if module.name.startswith("taic_jax.experiments.examples.run_"):
+        continue  # a program that runs when it is imported
     with contextlib.suppress(ImportError):  # of extras that are not installed
         importlib.import_module(module.name)
 for name in taic.__all__:
