@@ -221,7 +221,7 @@ def test_examples_train_by_the_command_line(name, tmp_path, monkeypatch):
     assert {"summary.json", "video.webp", "options"} <= {path.name for path in (tmp_path / "run").iterdir()}
 
 
-@pytest.mark.parametrize("path", sorted(EXAMPLES.glob("[a-z]*.*")), ids=lambda path: path.name)
+@pytest.mark.parametrize("path", sorted([*EXAMPLES.glob("pendulum.*"), *EXAMPLES.glob("reacher_arm.*")]), ids=str)
 def test_the_guide_holds_the_examples_word_for_word(path):
     language = {".py": "python", ".yaml": "yaml"}[path.suffix]
     blocks = re.findall(rf"^```{language}\n(.*?)^```$", GUIDE, re.MULTILINE | re.DOTALL)
