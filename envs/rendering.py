@@ -36,7 +36,8 @@ def render_mujoco(
     """
     model.vis.global_.offwidth = max(model.vis.global_.offwidth, width)
     model.vis.global_.offheight = max(model.vis.global_.offheight, height)
-    model.vis.quality.shadowsize = 1024  # looks as 4096 does, MuJoCo's default, and takes a third of the time on a CPU
+    # Half as large, and moving, it looks as with MuJoCo's defaults, 4096 and 4, and takes a fifth of the time on a CPU.
+    model.vis.quality.shadowsize, model.vis.quality.offsamples = 1024, 0
     camera_id = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, camera)  # -1 means a free one
     data = mujoco.MjData(model)
     frames = []
@@ -77,7 +78,7 @@ def write_film(path: Path, file: BinaryIO | io.BytesIO, frames: Frames, dt: floa
     check_film(path)
     if (kind := path.suffix.lower()) != ".mp4":
         return _animate(file, frames, dt, kind[1:])
-    every = _every(dt)
+    every = ticks_per_frame(dt)
     with tempfile.TemporaryDirectory() as folder:
         film = Path(folder) / "film.mp4"
         size = frames.shape[2], frames.shape[1]
@@ -106,11 +107,12 @@ def _ffmpeg() -> Any:
         raise MissingExtraError("imageio-ffmpeg", "video") from None
 
 
-def _every(dt: float) -> int:
-    """Return the ticks between two shown frames."""
+def ticks_per_frame(dt: float) -> int:
+    """Return the ticks of `dt` seconds between two frames of a film."""
     return max(round(0.04 / dt), 1)
 
 
 def _animate(file: Path | BinaryIO | io.BytesIO, frames: Frames, dt: float, kind: str) -> None:
-    first, *others = [Image.fromarray(frame) for frame in frames[:: _every(dt)]]
-    first.save(file, format=kind, save_all=True, append_images=others, duration=round(1000 * dt * _every(dt)), loop=0)
+    every = ticks_per_frame(dt)
+    first, *others = [Image.fromarray(frame) for frame in frames[::every]]
+    first.save(file, format=kind, save_all=True, append_images=others, duration=round(1000 * dt * every), loop=0)

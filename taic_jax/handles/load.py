@@ -16,7 +16,6 @@ from taic_jax.config import TAIC, CollectConfig, Config
 from taic_jax.config_io import from_mapping
 from taic_jax.envs.base import Env
 from taic_jax.options.model import OptionModel
-from taic_jax.pipeline import make_envs
 from taic_jax.rl.agent import Agent
 from taic_jax.runtime.checkpoint import ArtifactError
 from taic_jax.runtime.files import read_description
@@ -42,6 +41,8 @@ class Handle:
     @cached_property
     def env(self) -> Env:
         """The task."""
+        from taic_jax.pipeline import make_envs  # its imports take a second, which an agent without its task need not
+
         with jax.ensure_compile_time_eval():  # its first use may be in a function that is traced
             return make_envs(dataclasses.replace(self.config, collect=CollectConfig()))[0]
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from taic_jax.handles.load import Handle
 
 PROGRAM = "taic play"
-WINDOW = 80  # ticks in the strip of options
+WINDOW = 80  # frames in the strip of options
 MARK = (255, 255, 255)
 
 
@@ -44,7 +44,7 @@ def execute(command: Command, handle: "Handle") -> None:
     agent_of(handle, methods[0], "--methods", command.seed)
     if command.ticks < 0:
         raise impossible("--ticks", command.ticks, "at least 0", 0)
-    from taic_jax.envs.rendering import check_film, write_film
+    from taic_jax.envs.rendering import check_film, ticks_per_frame, write_film
     from taic_jax.runtime.files import atomic_file
 
     check_film(command.out)
@@ -53,15 +53,16 @@ def execute(command: Command, handle: "Handle") -> None:
     films = [film(handle, name, command) for name in methods]
     frames = np.concatenate([np.pad(x, ((0, max(map(len, films)) - len(x)), *[(0, 0)] * 3), "edge") for x in films], 2)
     with atomic_file(command.out) as file:
-        write_film(command.out, file, frames, handle.env.dt)
+        write_film(command.out, file, frames, handle.env.dt * ticks_per_frame(handle.env.dt))
     print(command.out)
 
 
 def film(handle: "Handle", method: str, command: Command) -> np.ndarray:
-    """Return the frames [T, H, W, 3] of one episode, or of `--ticks` ticks, and print the return."""
+    """Return the frames [F, H, W, 3] of one episode, or of `--ticks` ticks, and print the return."""
     import jax
 
     from taic_jax.analysis.evaluate import trace
+    from taic_jax.envs.rendering import ticks_per_frame
 
     env, agent = handle.env, handle.agents[method][command.seed]
     length, key = command.ticks or env.episode_length, jax.random.key(command.key)
@@ -78,7 +79,9 @@ def film(handle: "Handle", method: str, command: Command) -> np.ndarray:
     print(f"{label}: return {ticks.reward.sum():,.1f} in {end} ticks and {count} decisions")
     latest = np.maximum.accumulate(np.where(ticks.decision, np.arange(end), 0))
     marks = ticks.decision if agent.executor.length > 1 else np.zeros(end, bool)  # flat PPO decides at every tick
-    return with_label(with_options(env.render(ticks.extras), ticks.option[latest], marks), label)
+    shown = np.arange(0, end, ticks_per_frame(env.dt))
+    frames = env.render(jax.tree.map(lambda x: x[shown], ticks.extras))
+    return with_label(with_options(frames, ticks.option[latest[shown]], np.logical_or.reduceat(marks, shown)), label)
 
 
 def with_label(frames: np.ndarray, text: str) -> np.ndarray:
@@ -92,7 +95,7 @@ def with_label(frames: np.ndarray, text: str) -> np.ndarray:
 
 
 def with_options(frames: np.ndarray, options: np.ndarray, decision: np.ndarray) -> np.ndarray:
-    """Draw the options [T, D] of the last ticks below each frame, as colours, with a mark at each decision."""
+    """Draw the options [F, D] of the last frames below each, as colours, with a mark at each decision."""
     count, height, width, _ = frames.shape
     colours = np.zeros((count, 3))
     shown = min(3, options.shape[1])

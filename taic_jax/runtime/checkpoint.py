@@ -20,7 +20,6 @@ from typing import Any, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from orbax.checkpoint import v1 as ocp
 
 from taic_jax.runtime.files import PARTIAL, TEMPORARY, SaveError, make_room, writes_here, writing
 from taic_jax.runtime.hosts import agree
@@ -108,6 +107,8 @@ class Checkpoints:
         path, arrays = self.directory / str(step), plain_arrays(tree)
         layout = [[name, array.dtype.name, list(array.shape)] for name, array in arrays.items()]
         packed = np.concatenate([_bytes(array) for array in arrays.values()])
+        from orbax.checkpoint import v1 as ocp
+
         options = ocp.options.ArrayOptions(saving=ocp.options.ArrayOptions.Saving(use_ocdbt=False))  # for many arrays
         with _saving(path, path), ocp.Context(array_options=options):
             self._pending = path, _begin(path, {PACKED: packed}, {LAYOUT: layout})
@@ -152,6 +153,8 @@ class Checkpoints:
 
 def _begin(path: Path, arrays: dict[str, np.ndarray], extra: dict[str, Any]) -> Callable[[], None]:
     """Begin to write arrays and `extra` metadata to the folder `path`; return a function that waits for the end."""
+    from orbax.checkpoint import v1 as ocp  # its import takes half a second, which to load an agent need not
+
     path.parent.mkdir(parents=True, exist_ok=True)
     if writes_here():
         make_room(path.parent, sum(array.nbytes for array in arrays.values()) + len(arrays) * 2**10 + 2**14)
@@ -177,6 +180,8 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], str]:
     """Return the arrays in a folder by dotted name, and the version of this package that wrote them."""
     if not path.exists():
         raise ArtifactError(f"{path}: expected an artifact, got nothing")
+    from orbax.checkpoint import v1 as ocp
+
     try:
         stored = ocp.metadata(str(path.absolute()))
         beside: Any = stored.custom_metadata or {}
