@@ -106,6 +106,16 @@ def test_the_animation_plays_in_real_time(tmp_path):
             assert (getattr(film, "n_frames"), film.info["duration"]) == (count, duration)  # noqa: B009
 
 
+@pytest.mark.parametrize("model", ["brax", "gym"])
+def test_a_fast_robot_does_not_outrun_the_floor(model):
+    env = make_env("half_cheetah", model=model)
+    physics = jax.tree.map(lambda x: np.asarray(x)[None], env.reset(jax.random.key(0)).physics)
+    tile = 80.0 / 60  # the MJCF draws 60 tiles on a floor of 80 m
+    frames = [env.render(physics.replace(qpos=physics.qpos + x * np.eye(env.model.nq)[0])) for x in (0.0, 100 * tile)]
+    first, far = (frame.astype(float)[0, 140:] for frame in frames)  # the floor's part of the picture
+    assert first.std() > 40 and np.abs(first - far).mean() < 4
+
+
 REFUSED = {
     "unknown task": ("--tasks nav2d half_cheeta", "unknown environment 'half_cheeta': did you mean 'half_cheetah'?"),
     "unknown option": ("--task nav2d", "unknown option --task; the nearest is --tasks"),

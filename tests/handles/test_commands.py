@@ -17,6 +17,7 @@ import taic_jax as taic
 from taic_jax.__main__ import COMMANDS, main
 from taic_jax.command_line import COMMON_FIELDS
 from taic_jax.config_io import preset_names
+from taic_jax.envs.locomotion import Locomotion
 from taic_jax.handles import assess, play
 from taic_jax.handles.play import MARK, with_label, with_options
 from taic_jax.run import PROGRAM
@@ -84,6 +85,21 @@ def test_play_films_an_episode_of_methods_side_by_side(run, tmp_path, capsys):
         single = env.render(jax.tree.map(lambda x: x[None], env.reset(jax.random.key(0)).physics))
         assert image.size == (2 * single.shape[2], single.shape[1]) and image.n_frames > 1
     assert files_of(run) == before
+
+
+def test_play_draws_only_the_frames_of_the_film(tmp_path, monkeypatch):
+    drawn, film = [], tmp_path / "film.webp"
+
+    def render(env, physics, **size):
+        drawn.append(physics.qpos)
+        return np.arange(2, dtype=np.uint8)[:, None, None, None] * 200 + np.zeros((2, 48, 64, 3), np.uint8)
+
+    monkeypatch.setattr(Locomotion, "render", render)
+    assert main(["play", "pretrained:hopper", "--ticks", "7", "--out", str(film)]) == 0  # ticks of 8 ms, frames of 40
+    assert [len(poses) for poses in drawn] == [2]
+    with Image.open(film) as image:
+        image.load()
+        assert (getattr(image, "n_frames"), image.info["duration"]) == (2, 40)  # noqa: B009
 
 
 @pytest.mark.parametrize("ground", [0, 250])
