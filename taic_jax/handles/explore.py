@@ -2,6 +2,8 @@
 
 import contextlib
 import io
+import signal
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -57,6 +59,9 @@ def execute(command: Command, handle: "Handle") -> None:
             raise impossible("--port", command.port, "a free port", free)
         page = OptionPage(server, env, scene, make_executor(handle.config.options, model), command.key)
         print(f"http://localhost:{command.port} (Ctrl-C ends it)", flush=True)
-        page.play()
+        ended = threading.Event()
+        signal.signal(signal.SIGINT, lambda *_: ended.set())  # raised in a library's callback, it could be lost
+        page.play(ended)
+        raise KeyboardInterrupt
     finally:
         server.stop()

@@ -2,7 +2,6 @@
 
 import random
 import threading
-import time
 from functools import partial
 from typing import Any
 
@@ -54,10 +53,10 @@ class OptionPage:
         self._build()
         self.update()
 
-    def play(self) -> None:
-        """Show the replay again and again, and another one when a control has moved."""
+    def play(self, ended: threading.Event) -> None:
+        """Show the replay again and again until `ended`, and another one when a control has moved."""
         frame = 0
-        while True:
+        while not ended.wait(FRAME):
             if self.moved.is_set():
                 self.moved.clear()
                 self.update()
@@ -67,7 +66,6 @@ class OptionPage:
                 for body, mesh in self.meshes.items():
                     mesh.batched_positions, mesh.batched_wxyzs = self.places[now, :, body], self.turns[now, :, body]
             frame = (frame + 1) % (len(self.places) + REST)
-            time.sleep(FRAME)
 
     def update(self) -> None:
         """Execute the code and the ghosts, and draw their paths and the map."""
