@@ -35,16 +35,11 @@ class Seeds(Generic[Tree]):
     def __getitem__(self, seed: int) -> Tree:
         if not -len(self) <= seed < len(self):
             raise IndexError(f"seed {seed}: expected one of the {len(self)} seeds of this run")
-        return _row(self.rows, seed)
+        row = jax.tree.map(lambda x: x[seed], jax.device_get(self.rows))  # on a device each shape would be compiled
+        return jax.device_put(row)
 
     def __iter__(self) -> Iterator[Tree]:
         return (self[k] for k in range(len(self)))
-
-
-@jax.jit  # array by array it would take half a second
-def _row(rows: Tree, row: Array | int) -> Tree:
-    """Return one row of a tree."""
-    return jax.tree.map(lambda x: x[row], rows)
 
 
 def _register(cls: type) -> None:
