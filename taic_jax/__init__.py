@@ -23,9 +23,9 @@ if TYPE_CHECKING:
         EvaluateConfig,
         FineTuneConfig,
         OptionsConfig,
-        PPOConfig,
         TrainConfig,
     )
+    from taic_jax.config.learners import PPOConfig, SACConfig
     from taic_jax.config_io import load_config
     from taic_jax.envs import AutoReset, Env, State, environment_names, make_env
     from taic_jax.envs.adapters import to_gymnasium
@@ -36,13 +36,14 @@ if TYPE_CHECKING:
     from taic_jax.options.model import OptionModel
     from taic_jax.pipeline import run_pipeline
     from taic_jax.rl.agent import Agent
-    from taic_jax.rl.ppo import train
+    from taic_jax.rl.learner import train
 
 _MODULES = {
     "analysis.evaluate": "evaluate record",
     "analysis.measures": "measure_option_space",
     "analysis.statistics": "bootstrap_interval iqm",
-    "config": "CollectConfig Config EnvConfig EvaluateConfig FineTuneConfig OptionsConfig PPOConfig TrainConfig",
+    "config": "CollectConfig Config EnvConfig EvaluateConfig FineTuneConfig OptionsConfig TrainConfig",
+    "config.learners": "PPOConfig SACConfig",
     "config_io": "load_config",
     "envs": "AutoReset Env State environment_names make_env",
     "envs.adapters": "to_gymnasium",
@@ -56,7 +57,7 @@ _MODULES = {
     "options.model": "OptionModel",
     "pipeline": "run_pipeline",
     "rl.agent": "Agent",
-    "rl.ppo": "train",
+    "rl.learner": "train",
 }
 _HOME = {name: module for module, names in _MODULES.items() for name in names.split()}
 

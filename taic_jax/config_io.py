@@ -235,9 +235,27 @@ def validate(config: Config) -> None:
         raise impossible(
             "options.source", repr(options.source), "the run that train.init names", repr(config.train.init)
         )
+    _check_learners(config)
     if "transfer" in baselines and not options.source:
         expected = "with transfer a run with options and a flat policy"
         raise impossible("train.baselines", "none: add --options RUN", expected)
+
+
+def _check_learners(config: Config) -> None:
+    """Check that each learner does all that is asked of it, and that SAC's rounds divide its iteration."""
+    train, flat = config.train, config.collect.learner
+    for applies, name, learner, needed in (
+        (train.fine_tune.epochs, "train.learner", train.learner, "ppo with train.fine_tune.epochs"),
+        (train.init, "train.learner", train.learner, "ppo with train.init"),
+        ("transfer" in train.baselines, "collect.learner", flat, "ppo with baseline transfer"),
+    ):
+        if applies and learner != "ppo":
+            raise impossible(name, learner, needed, "ppo")
+    for name, sac in (("collect", config.collect.sac), ("train", train.sac)):
+        if sac.rollout_length % sac.update_every:
+            valid = max(n for n in range(1, sac.update_every + 1) if sac.rollout_length % n == 0)
+            expected = f"a divisor of {name}.sac.rollout_length = {sac.rollout_length}"
+            raise impossible(f"{name}.sac.update_every", sac.update_every, expected, valid)
 
 
 def _check_bounds(name: str, kind: Any, value: Any) -> None:
@@ -254,17 +272,19 @@ def _check_bounds(name: str, kind: Any, value: Any) -> None:
 def _check_limits(config: Config) -> None:
     """Check the fields whose bounds are other fields, or products of them."""
     values, baselines = dict(walk(config)), config.train.baselines
-    collected = "collect.ppo.num_envs * collect.ppo.rollout_length"  # flat PPO is configured by collect.ppo
-    trained = "train.ppo.num_envs * train.ppo.rollout_length"
+    flat, over_options = f"collect.{config.collect.learner}", f"train.{config.train.learner}"
+    collected, trained = (f"{x}.num_envs * {x}.rollout_length" for x in (flat, over_options))
+    by_ppo = over_options == "train.ppo"
     for applies, name, allowed, expected, other in (
-        (True, "collect.ppo.minibatch_size", le, "at most", collected),
+        (flat == "collect.ppo", "collect.ppo.minibatch_size", le, "at most", collected),
         (True, "collect.ticks", ge, "at least one iteration,", collected),
-        (True, "train.ppo.minibatch_size", le, "at most", trained),
+        (by_ppo, "train.ppo.minibatch_size", le, "at most", trained),
+        *((True, f"{x}.sac.update_every", le, "at most", f"{x}.sac.rollout_length") for x in ("collect", "train")),
         (config.train.fine_tune.epochs, "train.fine_tune.minibatch_size", le, "at most", trained),
         (True, "train.ticks", ge, "at least one iteration,", trained),
-        (True, "options.length", le, "at most", "train.ppo.rollout_length"),
+        (by_ppo, "options.length", le, "at most", "train.ppo.rollout_length"),
         (True, "options.shortest", le, "at most", "options.length"),
-        ("repeat" in baselines, "options.length", le, "with baseline repeat at most", "collect.ppo.rollout_length"),
+        ("repeat" in baselines, "options.length", le, "with baseline repeat at most", f"{flat}.rollout_length"),
         (baselines, "train.ticks", ge, "at least an iteration of baselines,", collected),
     ):
         limit = math.prod(values[factor] for factor in other.split(" * "))

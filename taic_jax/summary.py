@@ -13,12 +13,20 @@ from rich.table import Table
 from taic_jax.analysis.evaluate import record
 from taic_jax.analysis.statistics import iqm, summarize
 from taic_jax.artifacts.experience import experience_bytes
-from taic_jax.config import COLLECT, METHOD_LABELS, Config, collector_is_baseline, experience_ticks, needs_collect
+from taic_jax.config import (
+    COLLECT,
+    METHOD_LABELS,
+    Config,
+    collector_is_baseline,
+    experience_ticks,
+    needs_collect,
+    settings_of,
+)
 from taic_jax.envs.base import Env
 from taic_jax.envs.rendering import write_webp
 from taic_jax.nonfinite import FINITE, QUANTITIES
 from taic_jax.rl.agent import Agent
-from taic_jax.rl.ppo import num_iterations
+from taic_jax.rl.learner import num_iterations
 from taic_jax.runtime.checkpoint import version_of
 from taic_jax.runtime.driver import Run, Stopped
 from taic_jax.runtime.files import atomic_file, json_safe, writes_here
@@ -32,15 +40,16 @@ MIB = 2**20
 def plan(config: Config, env: Env, source: Env) -> str:
     """Return the cost of a run: interactions and memory, one line per stage."""
     collect, options, train, collects = config.collect, config.options, config.train, needs_collect(config)
-    rows = [("collect", source, collect.ppo, collect.ticks)] if collects else []
-    rows.append(("train", env, train.ppo, train.ticks))
+    flat = settings_of(collect)
+    rows = [("collect", source, flat, collect.ticks)] if collects else []
+    rows.append(("train", env, settings_of(train), train.ticks))
     for name in train.baselines:
         if not (name == "flat" and collector_is_baseline(config)):
-            rows.append((name, env, collect.ppo, train.ticks + (collect.ticks if name == "total" else 0)))
+            rows.append((name, env, flat, train.ticks + (collect.ticks if name == "total" else 0)))
     lines = []
-    for stage, task, ppo, ticks in rows:
-        iterations = num_iterations(ppo, ticks)
-        real = iterations * ppo.num_envs * ppo.rollout_length
+    for stage, task, learner, ticks in rows:
+        iterations = num_iterations(learner, ticks)
+        real = iterations * learner.num_envs * learner.rollout_length
         lines.append(f"{stage:8} {task.name}: {real:,} ticks x {config.seeds} seeds in {iterations} iterations")
     names = ", ".join(options.experience or (COLLECT,))
     learn = f"{'learn':8} {options.steps:,} gradient steps on windows of {options.length} ticks from {names}"

@@ -11,7 +11,7 @@ from jaxtyping import Array
 
 from taic_jax.analysis.evaluate import evaluate
 from taic_jax.artifacts.experience import as_experience
-from taic_jax.config import COLLECT, Config, OptionsConfig, PPOConfig
+from taic_jax.config import COLLECT, Config, OptionsConfig, SACConfig, replace, settings_of
 from taic_jax.envs.base import Env
 from taic_jax.networks import PolicyParams
 from taic_jax.options import learning
@@ -22,13 +22,14 @@ from taic_jax.options.model import OptionModel, make_networks
 from taic_jax.rl import fine_tune, normalize, ppo
 from taic_jax.rl.agent import Agent
 from taic_jax.rl.fine_tune import Tuned
+from taic_jax.rl.learner import Settings, learner_of, num_iterations
 
 STEPS_PER_LOG = 100
 
 
 @dataclass(frozen=True)
 class Trainer:
-    """Flat PPO, configured by `collect.ppo`; options are actions, each applied for `hold` ticks."""
+    """Flat control, configured by the learner of `collect`; options are actions, each applied for `hold` ticks."""
 
     env: Env
     config: Config
@@ -37,9 +38,15 @@ class Trainer:
     model: OptionModel | None = None
 
     @property
-    def settings(self) -> PPOConfig:
-        """Settings of PPO."""
-        return self.config.collect.ppo
+    def settings(self) -> Settings:
+        """Settings of the learner."""
+        return self._within(settings_of(self.config.collect))
+
+    def _within(self, settings: Settings) -> Settings:
+        """Keep no more decisions than there are ticks."""
+        if isinstance(settings, SACConfig):
+            return replace(settings, "capacity", min(settings.capacity, self.ticks))
+        return settings
 
     @property
     def executor(self) -> Executor:
@@ -54,19 +61,20 @@ class Trainer:
     @property
     def num_steps(self) -> int:
         """Whole steps in the budget of ticks."""
-        return self.ticks // self.unit
+        return num_iterations(self.settings, self.ticks)
 
     def init(self, key: Array) -> Any:
         """Return the state of an untrained policy."""
-        return ppo.init(self.settings, self.env, self.executor, key)
+        return learner_of(self.settings).init(self.settings, self.env, self.executor, key)
 
     def begin(self, state: Any, params: PolicyParams, statistics: normalize.Statistics) -> Any:
-        """Return the state with the weights of another policy; it explores anew, with the config's deviation."""
+        """Return the state of PPO with another policy's weights; it explores anew, with the config's deviation."""
         return state.replace(params=params.replace(log_std=state.params.log_std), obs_statistics=statistics)
 
     def step(self, state: Any) -> tuple[Any, dict, Experience | None]:
         """Run one iteration; return the next state, metrics and experience."""
-        state, metrics, ticks, _ = ppo.iterate(self.settings, self.env, self.executor, self.num_steps, state)
+        iterate = learner_of(self.settings).iterate
+        state, metrics, ticks, *_ = iterate(self.settings, self.env, self.executor, self.num_steps, state)
         return state, metrics, as_experience(ticks, self.env.proprioceptive_size)
 
     def assess(self, key: Array, state: Any) -> dict[str, dict[str, Array]]:
@@ -78,16 +86,16 @@ class Trainer:
 
     def agent(self, state: Any) -> Agent:
         """Return the policy with its executor, ready to act."""
-        return ppo.as_agent(self.settings, self.executor, state)
+        return learner_of(self.settings).as_agent(self.settings, self.executor, state)
 
 
 class OptionTrainer(Trainer):
-    """A policy over the options of a frozen model, configured by `train.ppo`."""
+    """A policy over the options of a frozen model, configured by the learner of `train`."""
 
     @property
-    def settings(self) -> PPOConfig:
-        """Settings of PPO."""
-        return self.config.train.ppo
+    def settings(self) -> Settings:
+        """Settings of the learner."""
+        return self._within(settings_of(self.config.train))
 
     @property
     def executor(self) -> OptionExecutor:
@@ -101,7 +109,7 @@ class FineTuneTrainer(OptionTrainer):
 
     def init(self, key: Array) -> tuple[ppo.TrainState, Tuned]:
         """Return the state of an untrained policy, and the learnt D."""
-        return super().init(key), fine_tune.init(self.settings, self.executor)
+        return super().init(key), fine_tune.init(self.config.train.ppo, self.executor)
 
     def begin(self, state: Any, params: PolicyParams, statistics: normalize.Statistics) -> Any:
         """Do so with the policy; D is that of the model."""
@@ -109,14 +117,14 @@ class FineTuneTrainer(OptionTrainer):
 
     def step(self, state: Any) -> tuple[Any, dict, None]:
         """Run one iteration of the policy and of D; return the next states and the metrics of both."""
-        settings = self.settings, self.config.train.fine_tune, self.env, self.executor, self.num_steps
+        settings = self.config.train.ppo, self.config.train.fine_tune, self.env, self.executor, self.num_steps
         policy, tuned, metrics = fine_tune.iterate(*settings, *state)
         return (policy, tuned), metrics, None
 
     def agent(self, state: Any) -> Agent:
         """Return the policy over the fine-tuned options."""
         policy, tuned = state
-        return ppo.as_agent(self.settings, fine_tune.tuned_executor(self.executor, tuned.decoder), policy)
+        return ppo.as_agent(self.config.train.ppo, fine_tune.tuned_executor(self.executor, tuned.decoder), policy)
 
 
 Row = tuple[Config, OptionModel | None]

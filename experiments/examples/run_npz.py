@@ -59,6 +59,8 @@ for seed in range(10):
         if duration in (0, about["length"]) or ended():
             seen = np.clip(scaled("obs_statistics", obs), -about["clip"], about["clip"])
             option, duration, first = mlp("actor", seen), 0, state
+            if about["bound"]:  # of SAC: the mean is squashed, and the other half of the outputs is its deviation
+                option = about["bound"] * np.tanh(np.split(option, 2)[0])
             if about["decoder"] == "open":
                 carry = np.split(np.tanh(dense(D + "first", option)), 2)
             if about["termination"] == "predict":

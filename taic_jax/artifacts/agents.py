@@ -22,14 +22,15 @@ from taic_jax.artifacts.models import (
     structure,
 )
 from taic_jax.artifacts.pretrained import locate
-from taic_jax.config import COLLECT, TAIC, Config, ConfigError, PPOConfig
+from taic_jax.config import COLLECT, TAIC, Config, ConfigError, PPOConfig, settings_of
 from taic_jax.config_io import from_mapping
 from taic_jax.envs.base import Env
-from taic_jax.networks import Policy, PolicyParams
+from taic_jax.networks import PolicyParams
 from taic_jax.options.execution import Executor, IdentityExecutor, make_executor
 from taic_jax.options.model import OptionModel
 from taic_jax.rl import normalize
 from taic_jax.rl.agent import Agent
+from taic_jax.rl.learner import empty_policy
 from taic_jax.runtime.checkpoint import ArtifactError
 from taic_jax.runtime.files import DESCRIPTION
 
@@ -53,9 +54,10 @@ def save_agents(folder: Path, agents: Agent, env: Env, config: Config, method: s
         "method": method,
         **describe(env),
         "observation_size": env.observation_size,
+        "learner": (config.train if method == TAIC else config.collect).learner,
         "hidden_sizes": list(agents.policy.hidden_sizes),
         **(structure(config.options) if method == TAIC else {}),
-        "seeds": len(agents.params.log_std),
+        "seeds": len(jax.tree.leaves(agents.params)[0]),
         "config": dataclasses.asdict(config),
     }
     save_artifact(folder, agents, description)
@@ -82,12 +84,13 @@ def _empty_agent(description: Description) -> Agent:
     body, config = description.body, description.config
     if description.method == TAIC:
         executor: Executor = make_executor(config.options, empty_model(body, config.options))
-        ppo = config.train.ppo
+        settings = settings_of(config.train)
     else:
         hold = config.options.length if description.method == "repeat" else 1
-        executor, ppo = IdentityExecutor(body.action_size, hold), config.collect.ppo
-    policy, size = Policy(executor.option_size, tuple(ppo.hidden_sizes)), description.observation_size
-    return Agent(executor, policy.init(jax.random.key(0), size, 0.0), normalize.init((size,)), policy)
+        executor, settings = IdentityExecutor(body.action_size, hold), settings_of(config.collect)
+    size = description.observation_size
+    policy, params = empty_policy(settings, executor.option_size, size, jax.random.key(0))
+    return Agent(executor, params, normalize.init((size,)), policy)
 
 
 def load_taic(source: str, env: Env, config: Config) -> tuple[OptionModel, Weights]:
@@ -96,7 +99,11 @@ def load_taic(source: str, env: Env, config: Config) -> tuple[OptionModel, Weigh
     Seed k takes the k-th, modulo their number. Raise ArtifactError for another body, observation or structure.
     """
     folder = locate(source) / AGENTS / TAIC
-    fields = {"observation_size": env.observation_size, "hidden_sizes": list(config.train.ppo.hidden_sizes)}
+    fields = {
+        "learner": "ppo",
+        "observation_size": env.observation_size,
+        "hidden_sizes": list(config.train.ppo.hidden_sizes),
+    }
     check_description(folder, "policy over options", env, fields | structure(config.options))
     agents: Any = load_agents(folder)
     return for_seeds(config.seeds, (agents.executor.model, (agents.params, agents.obs_statistics)))
@@ -108,7 +115,7 @@ def load_policy(source: str | Path, env: Env, config: PPOConfig, seeds: int) -> 
     Input weights of the proprioceptive slice are copied; other observations of `env` get zeros and new statistics.
     """
     folder = locate(source) / AGENTS / COLLECT
-    check_description(folder, "flat policy", env, {"hidden_sizes": list(config.hidden_sizes)})
+    check_description(folder, "flat policy", env, {"learner": "ppo", "hidden_sizes": list(config.hidden_sizes)})
     agents = load_agents(folder)
     params, statistics = for_seeds(seeds, (agents.params, agents.obs_statistics))
     fit = jax.vmap(lambda p, s: _fit(p, s, env.proprioceptive_size, env.observation_size))

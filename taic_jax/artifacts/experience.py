@@ -17,12 +17,12 @@ from jaxtyping import Array, Key
 
 from taic_jax.artifacts.demonstrations import read_demonstrations
 from taic_jax.artifacts.models import Body, check_description
-from taic_jax.config import CollectConfig, experience_ticks
+from taic_jax.config import CollectConfig, experience_ticks, settings_of
 from taic_jax.envs.base import Env
 from taic_jax.options.dataset import Experience
 from taic_jax.options.execution import IdentityExecutor
-from taic_jax.rl import ppo
 from taic_jax.rl.agent import Agent
+from taic_jax.rl.learner import learner_of, num_iterations
 from taic_jax.rl.rollout import Rollout
 from taic_jax.runtime.checkpoint import ArtifactError
 from taic_jax.runtime.files import DESCRIPTION, atomic_file, save_json, writing
@@ -38,30 +38,31 @@ def as_experience(ticks: Rollout, proprioceptive_size: int) -> Experience:
 
 
 def collect(config: CollectConfig, env: Env, key: Key[Array, ""]) -> tuple[Agent, dict[str, Array], Experience]:
-    """Train flat PPO in `env`; pure, so keys may be vmapped.
+    """Train a flat policy in `env`; pure, so keys may be vmapped.
 
     Return the agent, the metrics of every iteration, and the newest experience [T, B, ...], within the capacity.
     """
     config = as_arrays(config)
     executor = IdentityExecutor(env.action_size)
-    count = ppo.num_iterations(config.ppo, config.ticks)
+    settings = settings_of(config)
+    learner, count = learner_of(settings), num_iterations(settings, config.ticks)
     late = min(num_blocks(config), count)
 
-    def step(keep: bool, state: ppo.TrainState, _: None) -> tuple[ppo.TrainState, Any]:
-        state, metrics, ticks, _judgement = ppo.iterate(config.ppo, env, executor, count, state)
+    def step(keep: bool, state: Any, _: Any) -> tuple[Any, Any]:
+        state, metrics, ticks, *_ = learner.iterate(settings, env, executor, count, state)
         return state, (metrics, as_experience(ticks, env.proprioceptive_size) if keep else None)
 
-    state = ppo.init(config.ppo, env, executor, key)
-    state, (early, _) = jax.lax.scan(partial(step, False), state, None, count - late)
+    first = learner.init(settings, env, executor, key)
+    state, (early, _) = jax.lax.scan(partial(step, False), first, None, count - late)
     state, (last, blocks) = jax.lax.scan(partial(step, True), state, None, late)
     metrics = jax.tree.map(lambda *parts: jnp.concatenate(parts), early, last)
     experience = jax.tree.map(lambda x: x.reshape((-1, *x.shape[2:])), blocks)
-    return ppo.as_agent(config.ppo, executor, state), metrics, experience
+    return learner.as_agent(settings, executor, state), metrics, experience
 
 
 def num_blocks(config: CollectConfig) -> int:
     """Return the number of iterations in the experience, at least one."""
-    return max(experience_ticks(config) // (config.ppo.num_envs * config.ppo.rollout_length), 1)
+    return max(num_iterations(settings_of(config), experience_ticks(config)), 1)
 
 
 def experience_bytes(env: Env, ticks: int) -> int:

@@ -79,7 +79,7 @@ def described(folder: Path, kind: str) -> dict[str, Any]:
     if (version := description.get("format", FORMAT)) > FORMAT:
         writer = f"taic_jax {description.get('taic_jax')} wrote format {version}"
         raise ArtifactError(f"{folder}: {writer}, this is taic_jax {__version__}, which reads formats to {FORMAT}")
-    return description
+    return {"learner": "ppo"} | description  # the first agents had no other
 
 
 def save_artifact(folder: Path, tree: Any, description: dict[str, Any]) -> None:

@@ -7,7 +7,7 @@ import jax
 import psutil
 
 from taic_jax.artifacts.experience import experience_bytes
-from taic_jax.config import Config, ConfigError, Shard, experience_ticks, needs_collect, replace
+from taic_jax.config import Config, ConfigError, Shard, experience_ticks, needs_collect, replace, settings_of
 from taic_jax.options.dataset import HELD_OUT_EVERY, STRETCH
 from taic_jax.pipeline import make_envs, run_pipeline
 from taic_jax.runtime.logging import count_of
@@ -35,7 +35,8 @@ def calibrate(config: Config, folder: Path, shard: Shard = "none") -> Cost:
     early = replace(config, "evaluate.video_ticks", 0)
     for name, value in (("since", 0.0), ("until", 1.0), ("fraction", 1.0)):  # the first steps hold few windows
         early = replace(early, f"options.{name}", value)
-    most = max(STEPS, -(-STRETCH * HELD_OUT_EVERY * config.options.length // config.collect.ppo.rollout_length))
+    window = STRETCH * HELD_OUT_EVERY * config.options.length  # ticks of which some are held out
+    most = max(STEPS, -(-window // settings_of(config.collect).rollout_length))
     try:
         summary = run_pipeline(early, folder, quiet=True, shard=shard, most=most).summary
     except DivergedError as error:

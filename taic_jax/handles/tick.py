@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array
 
 from taic_jax.envs.errors import MissingExtraError
+from taic_jax.networks import SquashedParams
 from taic_jax.options.execution import OptionExecutor
 from taic_jax.rl.agent import Agent, advance
 from taic_jax.rl.normalize import CLIP
@@ -66,4 +67,5 @@ def export(agent: Agent, formats: Sequence[str]) -> tuple[dict[str, bytes], dict
     layers = {x: {name.rpartition(".")[0] for name in arrays if f".{x}." in name} for x in NETWORKS}
     ordered = {x: sorted(names, key=lambda name: (len(name), name)) for x, names in layers.items()}
     about = {"observation_size": agent.observation_size, "actions": [-1, 1], "carry": carry, "layers": ordered}
-    return files, {**about, "activation": "tanh", "clip": CLIP, "length": agent.executor.length}
+    bound = float(agent.params.bound) if isinstance(agent.params, SquashedParams) else None
+    return files, {**about, "activation": "tanh", "clip": CLIP, "bound": bound, "length": agent.executor.length}

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, Key
 
-from taic_jax.networks import Policy, PolicyParams
+from taic_jax.networks import Policy, PolicyParams, SquashedParams, SquashedPolicy
 from taic_jax.options.execution import Executor
 from taic_jax.rl import normalize
 from taic_jax.rl.rollout import DecideFn
@@ -39,9 +39,9 @@ class Agent(struct.PyTreeNode):
     """A policy over options with its parameters, and the executor of the options: all that acting needs."""
 
     executor: Executor
-    params: PolicyParams
+    params: PolicyParams | SquashedParams
     obs_statistics: normalize.Statistics
-    policy: Policy = struct.field(pytree_node=False)
+    policy: Policy | SquashedPolicy = struct.field(pytree_node=False)
 
     @property
     def observation_size(self) -> int:
@@ -108,6 +108,5 @@ def advance(agent: Agent, carry: Acting, obs: ArrayLike, noise: Float[Array, " Z
 def _decide(
     agent: Agent, exploration: Scalar, obs: Float[Array, "B S"], noise: Float[Array, "B D"]
 ) -> tuple[Float[Array, "B D"], Float[Array, " B"]]:
-    distribution: Any = agent.policy.distribution(agent.params, normalize.normalize(agent.obs_statistics, obs))
-    option = distribution.loc + exploration * distribution.scale_diag * noise
-    return option, distribution.log_prob(option)
+    policy: Any = agent.policy
+    return policy.draw(agent.params, normalize.normalize(agent.obs_statistics, obs), exploration, noise)

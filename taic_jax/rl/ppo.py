@@ -3,7 +3,6 @@
 Flat PPO is the same code with the identity executor, whose options are actions that end after one tick.
 """
 
-from functools import partial
 from typing import Any
 
 import jax
@@ -13,7 +12,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from taic_jax.config import PPOConfig
-from taic_jax.envs.base import Env, State
+from taic_jax.envs.base import Env
 from taic_jax.envs.wrappers import AutoReset
 from taic_jax.networks import Policy, PolicyParams
 from taic_jax.nonfinite import first_nonfinite
@@ -21,9 +20,9 @@ from taic_jax.options.execution import Executor
 from taic_jax.rl import normalize
 from taic_jax.rl.agent import Agent
 from taic_jax.rl.returns import Judgement, semi_markov_advantages
-from taic_jax.rl.rollout import Rollout, RolloutCarry, count_durations, rollout, start
+from taic_jax.rl.rollout import Rollout, RolloutCarry, pack_metrics, rollout, rollout_metrics, start
 from taic_jax.rl.update import LOSSES, Decisions, Update, make_optimizer, update
-from taic_jax.types import Scalar, as_arrays
+from taic_jax.types import Scalar
 
 
 class TrainState(struct.PyTreeNode):
@@ -110,7 +109,7 @@ def collect(
 ) -> tuple[RolloutCarry, Rollout]:
     """Roll the policy out for T ticks in B environments."""
     decide = as_agent(config, executor, state).decide()
-    return rollout(AutoReset(env), executor, decide, state.running, key, config.rollout_length, keep=_pack_metrics)
+    return rollout(AutoReset(env), executor, decide, state.running, key, config.rollout_length, keep=pack_metrics)
 
 
 def judge(
@@ -168,44 +167,9 @@ def _explore_anew(
 
 
 def _metrics(config: PPOConfig, state: TrainState, ticks: Rollout, result: Update, length: int) -> dict[str, Array]:
-    """Return the scalars of one iteration and, if options take more than one tick, their durations [L]."""
+    """Return the terms of one iteration's updates, and the metrics of its rollout."""
     count = jnp.sum(ticks.decision, dtype=jnp.int32)
     num_updates = config.epochs * ((count + config.minibatch_size - 1) // config.minibatch_size)
     terms = dict(zip(LOSSES, result.terms / num_updates.astype(jnp.float32), strict=True))
-    return {
-        # The mean over each environment's last finished episode; NaN before the first.
-        "return": jnp.nanmean(state.running.last_return),
-        "episodes": jnp.sum(ticks.terminated | ticks.truncated, dtype=jnp.int32).astype(jnp.float32),
-        "decisions": count.astype(jnp.float32),
-        "duration": ticks.decision.size / count.astype(jnp.float32),
-        "std": jnp.mean(jnp.exp(state.params.log_std)),
-        **terms,
-        **{f"mean/{name}": jnp.mean(ticks.extras[..., i]) for i, name in enumerate(sorted(state.running.env.metrics))},
-        **({"durations": count_durations(ticks, length)} if length > 1 else {}),
-    }
-
-
-def _pack_metrics(state: State) -> Array:
-    """Return the metrics of a tick as one array, in the order of their names: each array slows the loop down."""
-    return (
-        jnp.stack([state.metrics[name] for name in sorted(state.metrics)], axis=-1) if state.metrics else state.reward
-    )
-
-
-def num_iterations(config: PPOConfig, ticks: int) -> int:
-    """Return the number of whole iterations in a budget of ticks."""
-    return ticks // (config.num_envs * config.rollout_length)
-
-
-def train(
-    config: PPOConfig, env: Env, executor: Executor, key: Key[Array, ""], ticks: int
-) -> tuple[Agent, dict[str, Array]]:
-    """Train a policy over the executor's options for `ticks` interactions; pure, so keys may be vmapped.
-
-    Returns the agent and the metrics of every iteration, leading axis the iteration.
-    """
-    config = as_arrays(config)
-    iterations = num_iterations(config, ticks)
-    step = partial(iterate, config, env, executor, iterations)
-    state, metrics = jax.lax.scan(lambda s, _: step(s)[:2], init(config, env, executor, key), None, iterations)
-    return as_agent(config, executor, state), metrics
+    std = {"std": jnp.mean(jnp.exp(state.params.log_std))}
+    return std | terms | rollout_metrics(state.running, ticks, length)

@@ -96,6 +96,27 @@ def nothing(state: State) -> None:
     """Keep no extras of a tick."""
 
 
+def pack_metrics(state: State) -> Array:
+    """Return the metrics of a tick as one array, in the order of their names: each array slows the loop down."""
+    return (
+        jnp.stack([state.metrics[name] for name in sorted(state.metrics)], axis=-1) if state.metrics else state.reward
+    )
+
+
+def rollout_metrics(running: RolloutCarry, ticks: Rollout, length: int) -> dict[str, Array]:
+    """Return scalars of ticks whose extras are packed and, if options take more than one tick, their durations [L]."""
+    count = jnp.sum(ticks.decision, dtype=jnp.float32)
+    return {
+        # The mean over each environment's last finished episode; NaN before the first.
+        "return": jnp.nanmean(running.last_return),
+        "episodes": jnp.sum(ticks.terminated | ticks.truncated, dtype=jnp.float32),
+        "decisions": count,
+        "duration": ticks.decision.size / count,
+        **{f"mean/{name}": jnp.mean(ticks.extras[..., i]) for i, name in enumerate(sorted(running.env.metrics))},
+        **({"durations": count_durations(ticks, length)} if length > 1 else {}),
+    }
+
+
 def count_durations(ticks: Rollout, length: int, where: Array | bool = True) -> Float[Array, " L"]:
     """Return the number of options that ended after 1, 2, ... `length` ticks, among ticks [T, B] with `where`."""
     ended = ticks.ended & where

@@ -12,7 +12,7 @@ import numpy as np
 from jax.sharding import AxisType, Mesh, NamedSharding
 from jax.sharding import PartitionSpec as Spec
 
-from taic_jax.config import Config, ConfigError, Shard
+from taic_jax.config import Config, ConfigError, Shard, settings_of
 from taic_jax.envs.physics.mujoco import num_physical_cores
 from taic_jax.runtime.hosts import ALONE, Hosts, join, on_this_host
 from taic_jax.runtime.program_cache import compiler_options
@@ -114,11 +114,12 @@ def fewest(rows: int, cores: int) -> int:
 def make_devices(shard: Shard, config: Config) -> Devices:
     """Return the devices of a run, or raise ConfigError if its environments do not divide by them."""
     count = jax.device_count()
-    for name, ppo in (("collect", config.collect.ppo), ("train", config.train.ppo)):
-        if shard == ENVS and ppo.num_envs % count:
-            valid = f"the nearest valid value is {max(round(ppo.num_envs / count), 1) * count}"
-            expected = f"expected {name}.ppo.num_envs to be a multiple of the {count} devices"
-            raise ConfigError(f"--shard envs: {expected}, got {ppo.num_envs}; {valid}")
+    for name, group in (("collect", config.collect), ("train", config.train)):
+        num_envs = settings_of(group).num_envs
+        if shard == ENVS and num_envs % count:
+            valid = f"the nearest valid value is {max(round(num_envs / count), 1) * count}"
+            expected = f"expected {name}.{group.learner}.num_envs to be a multiple of the {count} devices"
+            raise ConfigError(f"--shard envs: {expected}, got {num_envs}; {valid}")
     return Devices(shard)
 
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import psutil
 
 from taic_jax.artifacts.experience import experience_bytes, num_blocks
-from taic_jax.config import Config, ConfigError, experience_ticks, needs_collect
+from taic_jax.config import Config, ConfigError, experience_ticks, needs_collect, settings_of
 from taic_jax.options.dataset import Experience, make_dataset
 from taic_jax.pipeline import make_envs
 from taic_jax.trainer import init_rows, make_trainer, step_rows
@@ -60,9 +60,9 @@ def _step_bytes(rows: Config, env: Any, stage: str, keys: jax.Array) -> int:
 
 def _experience(config: Config, env: Any) -> list[Experience]:
     """Return the shapes of the experience for learning options, one row of each source."""
-    ppo = config.collect.ppo
-    ticks = min(num_blocks(config.collect) * ppo.rollout_length, config.collect.ticks // ppo.num_envs)
-    shapes = [(1, ticks, ppo.num_envs, *last) for last in ([env.proprioceptive_size], [env.action_size], [], [])]
+    flat = settings_of(config.collect)
+    ticks = min(num_blocks(config.collect) * flat.rollout_length, config.collect.ticks // flat.num_envs)
+    shapes = [(1, ticks, flat.num_envs, *last) for last in ([env.proprioceptive_size], [env.action_size], [], [])]
     one = Experience(*map(jax.ShapeDtypeStruct, shapes, [jnp.float32] * 3 + [jnp.bool]))
     return [one] * max(len(config.options.experience), 1)
 

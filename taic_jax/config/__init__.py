@@ -5,40 +5,31 @@ static: it sets shapes or code paths. This module imports no JAX, so that the co
 """
 
 import dataclasses
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, NamedTuple, get_type_hints
+from typing import Annotated, Any, Literal, get_type_hints
 
+from taic_jax.config.base import (
+    TINY,
+    USUAL_BOUNDS,
+    Bounds,
+    ConfigError,
+    Learner,
+    Natural,
+    Positive,
+    Shard,
+    Share,
+    Track,
+    impossible,
+)
+from taic_jax.config.learners import FineTuneConfig, PPOConfig, SACConfig
 
-class ConfigError(ValueError):
-    """A mistake in a configuration, in one line."""
-
-
-def impossible(name: str, value: Any, expected: str, nearest: Any = math.inf) -> ConfigError:
-    """Return the error for an impossible value, with the nearest valid one if there is one."""
-    hint = "" if nearest == math.inf else f"; the nearest valid value is {nearest}"
-    return ConfigError(f"{name}: expected {expected}, got {value}{hint}")
-
-
-class Bounds(NamedTuple):
-    """Closed interval of the numbers that a field may hold."""
-
-    low: float
-    high: float = math.inf
-
-
-USUAL_BOUNDS: dict[Any, Bounds] = {int: Bounds(1), tuple[int, ...]: Bounds(1), float: Bounds(0)}
-"""Bounds of a field that is not annotated with others, by its type."""
-
-TINY = 1e-6
-Natural = Annotated[int, Bounds(0)]
-Positive = Annotated[float, Bounds(TINY)]
-Share = Annotated[float, Bounds(0, 1)]
-LogStd = Annotated[float, Bounds(-20, 2)]
-Shard = Literal["auto", "none", "seeds", "envs"]
-Track = Literal["none", "wandb", "trackio"]
-"""The axis to split over devices, and a tracker; no parts of an experiment, but needed without JAX."""
+__all__ = [
+    "COLLECT", "CONFIG_CLASSES", "METHOD_LABELS", "TAIC", "TINY", "USUAL_BOUNDS", "Bounds", "CollectConfig", "Config",
+    "ConfigError", "EnvConfig", "EvaluateConfig", "FineTuneConfig", "Learner", "Natural", "OptionsConfig", "PPOConfig",
+    "Positive", "SACConfig", "Shard", "Share", "Track", "TrainConfig", "collector_is_baseline", "experience_ticks",
+    "field_types", "impossible", "needs_collect", "replace", "settings_of", "walk",
+]  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -65,50 +56,8 @@ class EnvConfig:
 
 
 @dataclass(frozen=True)
-class PPOConfig:
-    """Proximal policy optimisation over decisions, with semi-Markov advantages (eq. 11-13)."""
-
-    num_envs: int = 16
-    """Environments that run side by side."""
-    rollout_length: int = 512
-    """Ticks per environment between two updates."""
-    epochs: int = 10
-    """Passes over the decisions of one rollout."""
-    minibatch_size: int = 128
-    """Decisions per gradient step."""
-    hidden_sizes: tuple[int, ...] = (64, 64)
-    """Widths of the hidden layers of actor and critic."""
-    learning_rate: float = 3e-4
-    """Step size of Adam."""
-    learning_rate_decay: bool = True
-    """Let the step size fall linearly to zero over the stage."""
-    gamma: Share = 0.99
-    """Discount per tick."""
-    lambda_: Share = 0.95
-    """Decay of the advantage estimate per decision."""
-    clip: Positive = 0.2
-    """Half-width of the interval that clips the probability ratio."""
-    value_weight: float = 0.5
-    """Weight of the critic's loss."""
-    entropy_weight: float = 0.0
-    """Weight of the entropy bonus."""
-    max_grad_norm: Positive = 0.5
-    """Global norm at which gradients are clipped."""
-    log_std_init: LogStd = -0.916
-    """Initial log standard deviation of the policy; exp(-0.916) = 0.4."""
-    reset_at_change: bool = False
-    """Set it to log_std_reset as soon as the task has changed (env.change_after) in half of the environments."""
-    log_std_reset: LogStd = 0.0
-    """Log standard deviation of the policy after that reset."""
-    normalize_advantage: bool = True
-    """Standardise the advantages of each minibatch."""
-    normalize_reward: bool = True
-    """Divide rewards by the running standard deviation of the return."""
-
-
-@dataclass(frozen=True)
 class CollectConfig:
-    """Stage collect: flat PPO, whose ticks become the experience."""
+    """Stage collect: a flat policy, whose ticks in training become the experience."""
 
     env: str = ""
     """Environment to collect in; empty takes env.name."""
@@ -116,7 +65,10 @@ class CollectConfig:
     """Budget of interactions per seed."""
     capacity: Natural = 0
     """Newest ticks of experience to keep, per seed; 0 keeps all."""
+    learner: Learner = "ppo"
+    """Learner of the flat policies, those of the baselines too: ppo or sac."""
     ppo: PPOConfig = PPOConfig()
+    sac: SACConfig = SACConfig()
 
 
 @dataclass(frozen=True)
@@ -185,22 +137,6 @@ class OptionsConfig:
 
 
 @dataclass(frozen=True)
-class FineTuneConfig:
-    """Fine-tuning of D by PPO on its actions, in turns with the policy over options; off unless epochs is set."""
-
-    epochs: Natural = 0
-    """Passes over the ticks of each iteration that update D; 0 leaves D unchanged."""
-    minibatch_size: int = 512
-    """Ticks per gradient step of D."""
-    learning_rate: float = 5e-4
-    """Step size of Adam for D; it decays like the policy's."""
-    std: Positive = 0.2
-    """Standard deviation of the noise on D's actions while training."""
-    kl_weight: float = 0.0
-    """Weight of the KL divergence from the learnt D."""
-
-
-@dataclass(frozen=True)
 class TrainConfig:
     """Stage train: the policy that acts by choosing options (section 3.5)."""
 
@@ -211,7 +147,10 @@ class TrainConfig:
     as well; or from the flat policy of the run that options.source names."""
     init: str = ""
     """Run whose policy over options is trained further, with its options (--init for short); empty for a new policy."""
+    learner: Learner = "ppo"
+    """Learner of the policy over options: ppo or sac."""
     ppo: PPOConfig = PPOConfig(log_std_init=0.0)
+    sac: SACConfig = SACConfig()
     fine_tune: FineTuneConfig = FineTuneConfig()
 
 
@@ -241,7 +180,7 @@ class Config:
 
 
 CONFIG_CLASSES = (
-    EnvConfig, PPOConfig, CollectConfig, OptionsConfig, FineTuneConfig, TrainConfig, EvaluateConfig, Config,
+    EnvConfig, PPOConfig, SACConfig, CollectConfig, OptionsConfig, FineTuneConfig, TrainConfig, EvaluateConfig, Config,
 )  # fmt: skip
 
 COLLECT = "collect"
@@ -256,6 +195,11 @@ METHOD_LABELS = {
     "transfer": "flat PPO from the source's policy",
 }
 """The methods of a summary in words: options, and the flat baselines by their names in `train.baselines`."""
+
+
+def settings_of(group: CollectConfig | TrainConfig) -> PPOConfig | SACConfig:
+    """Return the settings of the group's learner."""
+    return group.sac if group.learner == "sac" else group.ppo
 
 
 def experience_ticks(config: CollectConfig) -> int:

@@ -1,0 +1,101 @@
+"""The configuration of the learners: of a policy over options or actions, and of D's fine-tuning."""
+
+import math
+from dataclasses import dataclass
+from typing import Annotated
+
+from taic_jax.config.base import Bounds, LogStd, Natural, Positive, Share
+
+
+@dataclass(frozen=True)
+class PPOConfig:
+    """Proximal policy optimisation over decisions, with semi-Markov advantages (eq. 11-13)."""
+
+    num_envs: int = 16
+    """Environments that run side by side."""
+    rollout_length: int = 512
+    """Ticks per environment between two updates."""
+    epochs: int = 10
+    """Passes over the decisions of one rollout."""
+    minibatch_size: int = 128
+    """Decisions per gradient step."""
+    hidden_sizes: tuple[int, ...] = (64, 64)
+    """Widths of the hidden layers of actor and critic."""
+    learning_rate: float = 3e-4
+    """Step size of Adam."""
+    learning_rate_decay: bool = True
+    """Let the step size fall linearly to zero over the stage."""
+    gamma: Share = 0.99
+    """Discount per tick."""
+    lambda_: Share = 0.95
+    """Decay of the advantage estimate per decision."""
+    clip: Positive = 0.2
+    """Half-width of the interval that clips the probability ratio."""
+    value_weight: float = 0.5
+    """Weight of the critic's loss."""
+    entropy_weight: float = 0.0
+    """Weight of the entropy bonus."""
+    max_grad_norm: Positive = 0.5
+    """Global norm at which gradients are clipped."""
+    log_std_init: LogStd = -0.916
+    """Initial log standard deviation of the policy; exp(-0.916) = 0.4."""
+    reset_at_change: bool = False
+    """Set it to log_std_reset as soon as the task has changed (env.change_after) in half of the environments."""
+    log_std_reset: LogStd = 0.0
+    """Log standard deviation of the policy after that reset."""
+    normalize_advantage: bool = True
+    """Standardise the advantages of each minibatch."""
+    normalize_reward: bool = True
+    """Divide rewards by the running standard deviation of the return."""
+
+
+@dataclass(frozen=True)
+class SACConfig:
+    """Soft actor-critic over decisions, with a replay buffer of them and semi-Markov targets."""
+
+    num_envs: int = 16
+    """Environments that run side by side."""
+    rollout_length: int = 128
+    """Ticks per environment between two log lines."""
+    update_every: int = 4
+    """Ticks per environment between two updates."""
+    updates_per_decision: float = 1.0
+    """Gradient steps for each decision that ended."""
+    warmup: Natural = 10_000
+    """Ticks of uniformly random options, without updates, before the first one."""
+    capacity: int = 1_000_000
+    """Newest decisions to keep, per seed."""
+    batch_size: int = 256
+    """Decisions per gradient step."""
+    hidden_sizes: tuple[int, ...] = (256, 256)
+    """Widths of the hidden layers of actor and critics."""
+    layer_norm: bool = True
+    """Normalise the layers of the critics."""
+    bound: Positive = 3.0
+    """Greatest entry of an option code; an action's is 1."""
+    learning_rate: float = 3e-4
+    """Step size of Adam for actor, critics and temperature."""
+    gamma: Share = 0.99
+    """Discount per tick."""
+    tau: Share = 0.005
+    """Share of the critics that their targets take over at each gradient step."""
+    temperature: Positive = 1.0
+    """Initial temperature, the weight of the entropy, which is learnt."""
+    target_entropy: Annotated[float, Bounds(-math.inf)] = -1.0
+    """Entropy of the policy that the temperature is learnt for, per dimension, of options in units of their bound."""
+
+
+@dataclass(frozen=True)
+class FineTuneConfig:
+    """Fine-tuning of D by PPO on its actions, in turns with the policy over options; off unless epochs is set."""
+
+    epochs: Natural = 0
+    """Passes over the ticks of each iteration that update D; 0 leaves D unchanged."""
+    minibatch_size: int = 512
+    """Ticks per gradient step of D."""
+    learning_rate: float = 5e-4
+    """Step size of Adam for D; it decays like the policy's."""
+    std: Positive = 0.2
+    """Standard deviation of the noise on D's actions while training."""
+    kl_weight: float = 0.0
+    """Weight of the KL divergence from the learnt D."""

@@ -1,0 +1,50 @@
+"""The learners of a policy, PPO and SAC, behind the same functions."""
+
+from functools import partial
+from types import ModuleType
+from typing import Any
+
+import jax
+from jaxtyping import Array, Key
+
+from taic_jax.config import PPOConfig, SACConfig
+from taic_jax.envs.base import Env
+from taic_jax.networks import Policy, SquashedPolicy
+from taic_jax.options.execution import Executor
+from taic_jax.rl import ppo, sac
+from taic_jax.rl.agent import Agent
+from taic_jax.types import as_arrays
+
+Settings = PPOConfig | SACConfig
+
+
+def learner_of(settings: Settings) -> ModuleType:
+    """Return `ppo` or `sac`: modules with the functions `init`, `iterate`, `as_agent` and `make_policy`."""
+    return sac if isinstance(settings, SACConfig) else ppo
+
+
+def empty_policy(settings: Settings, option_size: int, observation_size: int, key: Key[Array, ""]) -> tuple[Any, Any]:
+    """Return a policy and parameters of its structure, whose numbers are not meaningful."""
+    sizes = option_size, tuple(settings.hidden_sizes)
+    policy: Any = SquashedPolicy(*sizes) if isinstance(settings, SACConfig) else Policy(*sizes)
+    return policy, policy.init(key, observation_size, 1.0)
+
+
+def num_iterations(settings: Settings, ticks: int) -> int:
+    """Return the number of whole iterations in a budget of ticks."""
+    return ticks // (settings.num_envs * settings.rollout_length)
+
+
+def train(
+    settings: Settings, env: Env, executor: Executor, key: Key[Array, ""], ticks: int
+) -> tuple[Agent, dict[str, Array]]:
+    """Train a policy over the executor's options for `ticks` interactions; pure, so keys may be vmapped.
+
+    Returns the agent and the metrics of every iteration, leading axis the iteration.
+    """
+    learner, settings = learner_of(settings), as_arrays(settings)
+    iterations = num_iterations(settings, ticks)
+    step = partial(learner.iterate, settings, env, executor, iterations)
+    state = learner.init(settings, env, executor, key)
+    state, metrics = jax.lax.scan(lambda s, _: step(s)[:2], state, None, iterations)
+    return learner.as_agent(settings, executor, state), metrics
