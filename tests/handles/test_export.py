@@ -19,7 +19,7 @@ import taic_jax as taic
 from taic_jax.__main__ import main
 from taic_jax.artifacts.agents import save_agents
 from taic_jax.artifacts.models import empty_model, save_options
-from taic_jax.networks import Policy
+from taic_jax.networks import Policy, SquashedPolicy
 from taic_jax.options.execution import IdentityExecutor, make_executor
 from taic_jax.rl import normalize
 from taic_jax.rl.agent import Agent
@@ -27,7 +27,10 @@ from taic_jax.rl.agent import Agent
 EXAMPLES = Path(__file__).parents[2] / "experiments" / "examples"
 ENV = f"{EXAMPLES / 'pendulum.py'}:Pendulum"
 EPISODES, TICKS, LENGTH = 10, 24, 4
-KINDS = [(decoder, rule) for decoder in ("open", "closed") for rule in ("fixed", "output", "predict")] + [("", "")]
+KINDS = [(decoder, rule) for decoder in ("open", "closed") for rule in ("fixed", "output", "predict")] + [
+    ("", ""),
+    ("", "sac"),
+]
 RUNNERS = {"jax": "run_stablehlo.py", "onnx": "run_onnx.py", "npz": "run_npz.py"}
 pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")
@@ -60,7 +63,7 @@ def scattered(tree, rng):
     return jax.tree.map(lambda x: rng.normal(0, 0.7, (2, *x.shape)).astype(np.float32), tree)
 
 
-def agents_of(env, config, decoder: str) -> Agent:
+def agents_of(env, config, decoder: str, learner: str) -> Agent:
     """Return two untrained agents [2] whose actions and ends of options depend on the observation."""
     rng, executor = np.random.default_rng(2), IdentityExecutor(1)
     if decoder:
@@ -68,21 +71,26 @@ def agents_of(env, config, decoder: str) -> Agent:
         scales = [x.replace(std=0.5 + x.std**2) for x in (model.state_scale, model.change_scale)]
         model = model.replace(state_scale=scales[0], change_scale=scales[1], delta=jnp.full(2, 4.0))
         executor = make_executor(config.options, model)
-    policy = Policy(executor.option_size, (4,))
+    policy = (SquashedPolicy if learner == "sac" else Policy)(executor.option_size, (4,))
     statistics = jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * 2), normalize.init((3,)))
     statistics = statistics.replace(mean=jnp.full((2, 3), 0.5), std=jnp.array([[1.0, 0.5, 0.05]] * 2))  # clips
-    return Agent(executor, scattered(policy.init(jax.random.key(0), 3, 0.0), rng), statistics, policy)
+    params = scattered(policy.init(jax.random.key(0), 3, 0.0), rng)
+    if learner == "sac":
+        params = params.replace(bound=np.array([1.0, 0.75], np.float32))
+    return Agent(executor, params, statistics, policy)
 
 
 @pytest.fixture(scope="module", params=KINDS, ids="-".join)
 def source(request, tmp_path_factory) -> tuple[Path, str]:
     """Return saved agents of each kind, and the name of their method."""
     decoder, rule = request.param
+    learner, rule = ("sac", "") if rule == "sac" else ("ppo", rule)
     fields = {"length": LENGTH, "decoder": decoder or "open", "termination": rule or "fixed"}
-    config = with_fields(CONFIG, env__name=ENV, **{f"options__{name}": value for name, value in fields.items()})
+    fields = {f"options__{name}": value for name, value in fields.items()}
+    config = with_fields(CONFIG, env__name=ENV, collect__learner=learner, **fields)
     env, method = taic.make_env(ENV), "taic" if decoder else "flat"
     folder = tmp_path_factory.mktemp("agents") / method
-    save_agents(folder, agents_of(env, config, decoder), env, config, method)
+    save_agents(folder, agents_of(env, config, decoder, learner), env, config, method)
     return folder, method
 
 

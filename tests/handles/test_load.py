@@ -21,14 +21,16 @@ from taic_jax.runtime.checkpoint import ArtifactError
 from taic_jax.runtime.driver import Run
 
 RULES = ("fixed", "output", "predict")
+KINDS = [(rule, "ppo") for rule in RULES] + [("fixed", "sac")]
 
 
-@pytest.fixture(scope="module", params=RULES)
+@pytest.fixture(scope="module", params=KINDS, ids="-".join)
 def run(request, tmp_path_factory) -> tuple[Path, Result]:
-    """Return a run under each termination rule, with every kind of method."""
+    """Return a run under each termination rule, and of each learner, with every kind of method."""
+    rule, learner = request.param
     config = with_fields(
-        CONFIG, options__termination=request.param, options__length=4, options__delta=0.44, options__delta_unit="error",
-        evaluate__video_ticks=0, train__baselines=("flat", "repeat"), train__ppo__hidden_sizes=(3,),
+        CONFIG, collect__learner=learner, train__learner=learner, options__termination=rule, options__length=4,
+        options__delta=0.44, options__delta_unit="error", evaluate__video_ticks=0, train__baselines=("flat", "repeat"), train__ppo__hidden_sizes=(3,),
     )  # fmt: skip
     folder = tmp_path_factory.mktemp("run") / "run"
     return folder, taic.run_pipeline(config, folder, quiet=True)
@@ -148,7 +150,7 @@ SPOILS = [unfinished, of_an_earlier_version, of_a_later_version, tampered, cut_s
 
 
 @pytest.mark.parametrize("spoil", SPOILS)
-@pytest.mark.parametrize("run", ["fixed"], indirect=True)
+@pytest.mark.parametrize("run", KINDS[:1], indirect=True)
 def test_what_cannot_be_loaded_is_refused_in_one_line(run, tmp_path, spoil):
     folder = tmp_path / "run"
     shutil.copytree(run[0], folder)
