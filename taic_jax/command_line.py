@@ -34,8 +34,8 @@ HELP_ALL = "--help-all"
 COMMON_FIELDS = (
     "env.name", "env.backend", "env.model", "env.goal", "collect.env", "collect.ticks", "options.experience",
     "options.length", "options.size", "options.decoder", "options.termination", "options.delta", "options.steps",
-    "train.ticks", "train.baselines", "train.ppo.num_envs", "train.ppo.learning_rate", "train.ppo.gamma",
-    "train.fine_tune.epochs", "evaluate.episodes", "seed", "seeds",
+    "collect.learner", "train.learner", "train.ticks", "train.baselines", "train.ppo.num_envs",
+    "train.ppo.learning_rate", "train.ppo.gamma", "train.fine_tune.epochs", "evaluate.episodes", "seed", "seeds",
 )  # fmt: skip
 """The fields of the config that --help shows; --help-all shows all."""
 FAILED, UNWRITTEN = 1, 74  # 74 is the system's "input/output error"

@@ -23,6 +23,7 @@ SYNONYMS = {
     "clip_range": "train.ppo.clip", "clip_coef": "train.ppo.clip", "ent_coef": "train.ppo.entropy_weight",
     "vf_coef": "train.ppo.value_weight", "n_envs": "train.ppo.num_envs", "n_steps": "train.ppo.rollout_length",
     "n_epochs": "train.ppo.epochs", "num_steps": "train.ppo.rollout_length", "total_timesteps": "train.ticks",
+    "buffer_size": "train.sac.capacity", "learning_starts": "train.sac.warmup", "algo": "train.learner",
     "timesteps": "train.ticks", "num_seeds": "seeds", "output": "run_dir", "out": "run_dir", "log_dir": "run_dir",
 }  # fmt: skip
 """Names of other libraries for a field."""

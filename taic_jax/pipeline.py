@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import psutil
 
 from taic_jax import trainer
 from taic_jax.artifacts.agents import Weights, load_policy, load_taic, save_agents
@@ -27,7 +28,7 @@ from taic_jax.runtime.devices import make_devices
 from taic_jax.runtime.driver import Run, drive
 from taic_jax.runtime.files import save_json
 from taic_jax.runtime.run_folder import RunFolder, Summary
-from taic_jax.summary import as_summary, write_video
+from taic_jax.summary import as_summary, replay_sizes, write_video
 from taic_jax.trainer import Trained
 from taic_jax.types import Seeds
 
@@ -70,6 +71,7 @@ def run_pipeline(
     devices = make_devices(shard, config)
     env, source = make_envs(config)
     inherited = take_over(config, env, source)  # refuses before anything is written
+    _check_memory(config, env, source)
     model, flat, policy = _for_points(inherited, len(points or (config,)))
     with Run.open(
         config, run_dir, points=points, resume=resume, overwrite=overwrite, quiet=quiet, devices=devices, **settings
@@ -102,6 +104,7 @@ def check_run(
     """
     env, source = make_envs(config)
     take_over(config, env, source)
+    _check_memory(config, env, source)
     if run_dir:
         RunFolder(run_dir).check(config, resume=resume, overwrite=overwrite)
     return env, source
@@ -137,6 +140,17 @@ def make_envs(config: Config) -> tuple[Env, Env]:
         expected = f"at most the {longest} ticks of an episode of {env.name}"
         raise impossible("options.length", config.options.length, expected, longest)
     return env, source
+
+
+def _check_memory(config: Config, env: Env, source: Env) -> None:
+    """Raise ConfigError if a replay buffer alone is larger than the memory of the machine."""
+    total = psutil.virtual_memory().total
+    for name, size in replay_sizes(config, env, source).items():
+        group = config.collect if name == COLLECT else config.train
+        if size > total:
+            fits = int(min(group.sac.capacity, group.ticks) * total / size / 2)
+            expected = f"a buffer within the memory, {total / 2**30:.0f} GiB, for {config.seeds} seeds"
+            raise impossible(f"{name}.sac.capacity", group.sac.capacity, expected, fits)
 
 
 class Inherited(NamedTuple):

@@ -99,7 +99,7 @@ def execute(command: Command) -> int:
                 checkpoint_seconds=command.checkpoint_seconds, shard=shard,
             )  # fmt: skip
         if not command.quiet:
-            Console().print(as_table(summary))
+            Console().print(as_table(summary, config.collect.learner))
             print(f"compare and look at runs:  python -m taic_jax.report {run_dir}")
             print(f"curves (extra viz):        tensorboard --logdir {run_dir}")
         print(RunFolder(run_dir).summary_path)

@@ -15,10 +15,10 @@ from taic_jax.analysis.statistics import iqm, summarize
 from taic_jax.artifacts.experience import experience_bytes
 from taic_jax.config import (
     COLLECT,
-    METHOD_LABELS,
     Config,
     collector_is_baseline,
     experience_ticks,
+    method_label,
     needs_collect,
     settings_of,
 )
@@ -27,6 +27,7 @@ from taic_jax.envs.rendering import write_webp
 from taic_jax.nonfinite import FINITE, QUANTITIES
 from taic_jax.rl.agent import Agent
 from taic_jax.rl.learner import num_iterations
+from taic_jax.rl.replay import replay_bytes
 from taic_jax.runtime.checkpoint import version_of
 from taic_jax.runtime.driver import Run, Stopped
 from taic_jax.runtime.files import atomic_file, json_safe, writes_here
@@ -60,7 +61,18 @@ def plan(config: Config, env: Env, source: Env) -> str:
             lines.append(f"{'keep':8} the newest {experience_ticks(collect):,} ticks of collect")
         memory = "" if options.source else f", {2 * size:,.0f} MiB while options are learnt"
         lines.append(f"{'memory':8} experience {size:,.0f} MiB on disk{memory}")
-    return "\n".join(lines)
+    replays = replay_sizes(config, env, source).items()
+    return "\n".join([*lines, *(f"{'memory':8} replay of {name} {size / MIB:,.0f} MiB" for name, size in replays)])
+
+
+def replay_sizes(config: Config, env: Env, source: Env) -> dict[str, int]:
+    """Return the bytes of SAC's replay buffers of all seeds, by the stage that has one."""
+    stages = (("collect", config.collect, source, env.action_size), ("train", config.train, env, config.options.size))
+    return {
+        name: config.seeds * replay_bytes(min(group.sac.capacity, group.ticks), task.observation_size, option_size)
+        for name, group, task, option_size in stages
+        if group.learner == "sac"
+    }
 
 
 def as_summary(run: Run, methods: Mapping[str, Trained]) -> Summary:
@@ -77,7 +89,7 @@ def as_summary(run: Run, methods: Mapping[str, Trained]) -> Summary:
     }
 
 
-def as_table(summary: Summary) -> Table:
+def as_table(summary: Summary, learner: str) -> Table:
     """Return a table of the returns of each method: interquartile means over seeds, and their 95 % intervals."""
     table = Table("method", box=SIMPLE, title="return of an episode", title_justify="left", title_style="")
     for column in ("untrained", "trained, as it explores", "its mean options or actions"):
@@ -85,7 +97,7 @@ def as_table(summary: Summary) -> Table:
     for name, method in summary["methods"].items():
         first = iqm(np.array(method["return"]["first_per_seed"], float))
         trained = [_interval(method[mode]) for mode in ("return", "return_mean_option")]
-        table.add_row(METHOD_LABELS.get(name, name), f"{first:,.0f}", *trained)
+        table.add_row(method_label(name, learner), f"{first:,.0f}", *trained)
     return table
 
 

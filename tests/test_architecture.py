@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-PARTS = ("analysis", "artifacts", "handles", "options", "report", "rl", "runtime", "sweep")
+PARTS = ("analysis", "artifacts", "config", "handles", "options", "report", "rl", "runtime", "sweep")
 FOLDERS = ("envs", "experiments", *(f"taic_jax/{name}" for name in PARTS))
 PACKAGE = sorted((ROOT / "taic_jax").glob("*.py")) + sorted(
     path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py")

@@ -37,7 +37,7 @@ def pipeline(monkeypatch):
         return None, {}
 
     fake = types.SimpleNamespace(run_pipeline=run_pipeline, check_run=lambda *args, **settings: ("env", "source"))
-    summary = types.SimpleNamespace(plan=lambda *args: "the plan", as_table=lambda summary: "the table")
+    summary = types.SimpleNamespace(plan=lambda *args: "the plan", as_table=lambda *args: "the table")
     monkeypatch.setitem(sys.modules, "taic_jax.pipeline", fake)
     monkeypatch.setitem(sys.modules, "taic_jax.summary", summary)
     return calls

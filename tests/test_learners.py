@@ -5,6 +5,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
+import psutil
 import pytest
 from tiny_runs import CONFIG, KilledError, assert_same_arrays, die, last_state, rows_of, tiny_steps, with_fields
 
@@ -110,6 +111,18 @@ def test_what_sac_cannot_do_is_refused(name):
         validate(with_fields(SAC, **changes))
     assert message in str(error.value)
     validate(with_fields(SAC, **{name: value for name, value in changes.items() if "baselines" in name and not value}))
+
+
+def test_a_buffer_larger_than_the_memory_is_refused_with_the_nearest_that_fits(capsys, tmp_path):
+    large = ["nav2d", "--train.learner", "sac", "--train.ticks", "1e12", "--train.sac.capacity", "1e12"]
+    run = ["--run-dir", str(tmp_path / "run"), "--quiet"]
+    for more in (["--dry-run"], []):
+        assert main([*large, *run, *more]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert "train.sac.capacity: expected a buffer within the memory" in line and not (tmp_path / "run").exists()
+    fits = int(line.rpartition(" ")[2])
+    bytes_ = 4 * fits * (2 * taic.make_env("nav2d").observation_size + 6 + 2)
+    assert 0.45 < bytes_ / psutil.virtual_memory().total < 0.55
 
 
 def test_an_unknown_learner_is_one_line(capsys):

@@ -44,7 +44,7 @@ def test_the_table_has_a_row_a_method_with_intervals_where_there_are_several_see
         "repeat": method([1.0, 2.0], [1.0, np.nan], [1.0, 2.0]),
     }
     console = Console(width=100, file=io.StringIO())
-    console.print(summary.as_table({"methods": methods}))
+    console.print(summary.as_table({"methods": methods}, "ppo"))
     lines = [line.split("  ") for line in console.file.getvalue().splitlines()]  # pyright: ignore
     cells = {cells[0]: cells[1:] for line in lines if (cells := [text.strip() for text in line if text.strip()])}
     low, high = summarize(seeds)["ci95"]

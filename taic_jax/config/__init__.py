@@ -28,7 +28,7 @@ __all__ = [
     "COLLECT", "CONFIG_CLASSES", "METHOD_LABELS", "TAIC", "TINY", "USUAL_BOUNDS", "Bounds", "CollectConfig", "Config",
     "ConfigError", "EnvConfig", "EvaluateConfig", "FineTuneConfig", "Learner", "Natural", "OptionsConfig", "PPOConfig",
     "Positive", "SACConfig", "Shard", "Share", "Track", "TrainConfig", "collector_is_baseline", "experience_ticks",
-    "field_types", "impossible", "needs_collect", "replace", "settings_of", "walk",
+    "field_types", "impossible", "method_label", "needs_collect", "replace", "settings_of", "walk",
 ]  # fmt: skip
 
 
@@ -195,6 +195,11 @@ METHOD_LABELS = {
     "transfer": "flat PPO from the source's policy",
 }
 """The methods of a summary in words: options, and the flat baselines by their names in `train.baselines`."""
+
+
+def method_label(method: str, learner: str) -> str:
+    """Return a method in words, with the flat learner's name."""
+    return METHOD_LABELS.get(method, method).replace("PPO", learner.upper())
 
 
 def settings_of(group: CollectConfig | TrainConfig) -> PPOConfig | SACConfig:

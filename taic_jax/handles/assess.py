@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from taic_jax import __version__
-from taic_jax.config import METHOD_LABELS, impossible
+from taic_jax.config import impossible, method_label
 from taic_jax.handles import command
 from taic_jax.handles.command import answer, methods_of
 
@@ -52,7 +52,8 @@ def execute(command: Command, handle: "Handle") -> None:
     if command.out:
         about = {"run": command.run, "env": handle.config.env.name, "episodes": command.episodes, "key": command.key}
         save_json(command.out, {**about, "explore": command.explore, "taic_jax": __version__, "methods": results})
-    Console().print(as_table(results, f"return on {handle.env.name}, {command.episodes} episodes a seed"))
+    labels = [method_label(name, handle.config.collect.learner) for name in results]
+    Console().print(as_table(results, labels, f"return on {handle.env.name}, {command.episodes} episodes a seed"))
 
 
 def measure(handle: "Handle", method: str, command: Command, trained: Any = None) -> dict[str, Any]:
@@ -79,12 +80,11 @@ def measure(handle: "Handle", method: str, command: Command, trained: Any = None
     return {name: summarize(np.where(lost, np.nan, x)) for name, x in values.items()}
 
 
-def as_table(results: dict[str, dict[str, Any]], title: str) -> Any:
+def as_table(results: dict[str, dict[str, Any]], labels: Sequence[str], title: str) -> Any:
     """Return a table with a column per method: the return with its interval over seeds, and means of all metrics."""
     from rich.box import SIMPLE
     from rich.table import Table
 
-    labels = [METHOD_LABELS.get(method, method) for method in results]
     table = Table("", *labels, box=SIMPLE, title=title, title_justify="left", title_style="")
     returns = [values["return"] for values in results.values()]
     table.add_row("mean", *(_cell(",.1f", x["mean"]) for x in returns))

@@ -9,7 +9,7 @@ import numpy as np
 import tyro
 from PIL import Image, ImageDraw
 
-from taic_jax.config import METHOD_LABELS, TAIC, impossible
+from taic_jax.config import TAIC, impossible, method_label
 from taic_jax.handles import command
 from taic_jax.handles.command import agent_of, answer, methods_of
 
@@ -75,7 +75,7 @@ def film(handle: "Handle", method: str, command: Command) -> np.ndarray:
     end = int(np.argmax(done)) + 1 if done.any() and not command.ticks else length
     ticks = jax.tree.map(lambda x: x[:end], ticks)
     count = int(ticks.decision.sum())
-    label = METHOD_LABELS.get(method, method)
+    label = method_label(method, handle.config.collect.learner)
     print(f"{label}: return {ticks.reward.sum():,.1f} in {end} ticks and {count} decisions")
     latest = np.maximum.accumulate(np.where(ticks.decision, np.arange(end), 0))
     marks = ticks.decision if agent.executor.length > 1 else np.zeros(end, bool)  # flat PPO decides at every tick

@@ -5,19 +5,20 @@ from typing import Any
 import numpy as np
 
 from taic_jax.analysis.statistics import bootstrap_interval, iqm
-from taic_jax.config import COLLECT, METHOD_LABELS
+from taic_jax.config import COLLECT, TAIC, method_label
 from taic_jax.report.runs import LoadedRun, ReportError, per_seed, read_run, run_of
 from taic_jax.runtime.files import json_safe
 
 DIGITS = 5  # significant, of curves
-LABELS = METHOD_LABELS | {"train": METHOD_LABELS["taic"], "learn": "learning of options"}
+STAGES = {"train": TAIC, "learn": "learning of options"}
 
 
 def label_of(run: LoadedRun, stage: str) -> str:
     """Return the name of a stage's method in words."""
+    learner = str(run.fields.get("collect.learner", "ppo"))
     if stage == COLLECT:
-        return LABELS["flat"] if run.flat_stage() == COLLECT else "flat PPO (collector)"
-    return LABELS.get(stage, stage)
+        return method_label("flat", learner) + ("" if run.flat_stage() == COLLECT else " (collector)")
+    return method_label(STAGES.get(stage, stage), learner)
 
 
 def stage_curves(run: LoadedRun, stage: str, points: int) -> dict[str, Any]:

@@ -33,8 +33,13 @@ class Replay(struct.PyTreeNode):
 
 
 def init(capacity: int, observation_size: int, option_size: int) -> Replay:
-    """Return an empty buffer; it takes 4 C (2 S + D + 2) bytes."""
+    """Return an empty buffer, of `replay_bytes`."""
     return Replay(jnp.zeros((capacity, 2 * observation_size + option_size + 2)), jnp.zeros((), jnp.int32))
+
+
+def replay_bytes(capacity: int, observation_size: int, option_size: int) -> int:
+    """Return the bytes of a buffer of one seed."""
+    return 4 * capacity * (2 * observation_size + option_size + 2)
 
 
 def init_pending(num_envs: int, observation_size: int, option_size: int) -> Transition:

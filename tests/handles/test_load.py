@@ -30,7 +30,8 @@ def run(request, tmp_path_factory) -> tuple[Path, Result]:
     rule, learner = request.param
     config = with_fields(
         CONFIG, collect__learner=learner, train__learner=learner, options__termination=rule, options__length=4,
-        options__delta=0.44, options__delta_unit="error", evaluate__video_ticks=0, train__baselines=("flat", "repeat"), train__ppo__hidden_sizes=(3,),
+        options__delta=0.44, options__delta_unit="error", evaluate__video_ticks=0, train__baselines=("flat", "repeat"),
+        train__ppo__hidden_sizes=(3,), train__sac__hidden_sizes=(3,),
     )  # fmt: skip
     folder = tmp_path_factory.mktemp("run") / "run"
     return folder, taic.run_pipeline(config, folder, quiet=True)
