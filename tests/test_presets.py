@@ -7,7 +7,7 @@ import pytest
 import yaml
 from tiny_runs import with_fields
 
-from taic_jax import config as config_module
+import taic_jax
 from taic_jax.config import Config, ConfigError, walk
 from taic_jax.config_io import load_config, preset_names, to_yaml, validate
 
@@ -26,7 +26,7 @@ def test_presets_load_are_valid_and_hold_only_differences(name):
             validate(preset)
         preset = with_fields(preset, options__source="runs/a")
     validate(preset)
-    text = (Path(config_module.__file__).parent / "experiments/presets" / f"{name}.yaml").read_text()
+    text = (Path(taic_jax.__file__).parent / "experiments/presets" / f"{name}.yaml").read_text()
     changes = yaml.safe_load(text)
     base = changes.pop("base", None)
     defaults = yaml.safe_load(to_yaml(load_config(base) if base else Config()))

@@ -22,7 +22,7 @@ from taic_jax.envs.physics.mujoco import num_physical_cores
 from taic_jax.experiments.benchmark.loops import Training, executor_of
 from taic_jax.experiments.benchmark.timing import seconds
 from taic_jax.options.execution import IdentityExecutor
-from taic_jax.rl import ppo
+from taic_jax.rl import learner
 from taic_jax.runtime.devices import Devices, open_devices
 from taic_jax.runtime.program_cache import keep_programs
 from taic_jax.runtime.run_folder import RunFolder
@@ -121,7 +121,7 @@ class Sweep:
         """Return the function that does one run and returns its curve."""
         env = envs.make_env(self.task)
         executor = IdentityExecutor(env.action_size)
-        return lambda config, key: ppo.train(config, env, executor, key, self.ticks)[1]["return"]
+        return lambda config, key: learner.train(config, env, executor, key, self.ticks)[1]["return"]
 
 
 def sweep_costs(sweep: Sweep, runs: int) -> dict[str, int | float]:

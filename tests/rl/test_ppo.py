@@ -17,7 +17,7 @@ from taic_jax.envs import Navigation, TimeLimit
 from taic_jax.networks import Policy, PolicyParams
 from taic_jax.nonfinite import QUANTITIES
 from taic_jax.options.execution import IdentityExecutor
-from taic_jax.rl import normalize, ppo, update
+from taic_jax.rl import learner, normalize, ppo, update
 from taic_jax.rl.agent import Agent
 from taic_jax.rl.returns import Judgement, semi_markov_advantages
 from taic_jax.rl.rollout import Rollout
@@ -219,7 +219,7 @@ def test_solves_the_probes():
         gamma=0.5, normalize_reward=False,
     )  # fmt: skip
     ticks = 50 * config.num_envs * config.rollout_length
-    agent, _ = jax.jit(lambda key: ppo.train(config, env, IdentityExecutor(1), key, ticks))(jax.random.key(0))
+    agent, _ = jax.jit(lambda key: learner.train(config, env, IdentityExecutor(1), key, ticks))(jax.random.key(0))
     # Constant at 0, Observed at -1 and 1, TwoStep at 0 and 1, Sign at -1 and 1.
     which, x = jnp.array([0, 1, 1, 2, 2, 3, 3]), jnp.array([0.0, -1.0, 1.0, 0.0, 1.0, -1.0, 1.0])
     obs = jax.vmap(env.observe)((x, which))
@@ -231,7 +231,7 @@ def test_solves_the_probes():
 
 
 def train(config: PPOConfig, key: jax.Array) -> tuple[Agent, dict[str, jax.Array]]:
-    return ppo.train(config, ENV, EXECUTOR, key, 2 * config.num_envs * config.rollout_length)
+    return learner.train(config, ENV, EXECUTOR, key, 2 * config.num_envs * config.rollout_length)
 
 
 train_alone, train_together = jax.jit(train), jax.jit(jax.vmap(train))
