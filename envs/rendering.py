@@ -36,7 +36,7 @@ def render_mujoco(
     """
     model.vis.global_.offwidth = max(model.vis.global_.offwidth, width)
     model.vis.global_.offheight = max(model.vis.global_.offheight, height)
-    # Half as large, and moving, it looks as with MuJoCo's defaults, 4096 and 4, and takes a fifth of the time on a CPU.
+    # A film looks as with MuJoCo's defaults, 4096 and 4, and takes a quarter of the time on a CPU.
     model.vis.quality.shadowsize, model.vis.quality.offsamples = 1024, 0
     camera_id = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, camera)  # -1 means a free one
     floor = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, "floor")

@@ -23,6 +23,7 @@ from tiny_runs import (
     assert_same_arrays,
     die,
     files_of,
+    methods_of,
     rows_of,
     tiny_steps,
     with_fields,
@@ -72,10 +73,6 @@ def assert_same_runs(a: Path, b: Path) -> None:
     assert methods_of(a) == methods_of(b) and rows_of(a) == rows_of(b)
     blocks = {name for name in files_of(b) if name.startswith("experience") or name == "config.yaml"}
     assert {name: files_of(a)[name] for name in blocks} == {name: files_of(b)[name] for name in blocks}
-
-
-def methods_of(folder: Path) -> dict:
-    return json.loads((folder / "summary.json").read_text())["methods"]
 
 
 def test_leaves_a_whole_run_behind(finished):

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -80,6 +81,11 @@ def die(monkeypatch: pytest.MonkeyPatch, owner: type, method: str, count: int) -
 def files_of(folder: Path) -> dict[str, bytes]:
     """Return what every file under a folder holds."""
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def methods_of(folder: Path) -> dict:
+    """Return the evaluations of a finished run, by method."""
+    return json.loads((folder / "summary.json").read_text())["methods"]
 
 
 def rows_of(folder: Path) -> list[dict]:

@@ -30,7 +30,7 @@ from taic_jax.options.execution import Executor, IdentityExecutor, make_executor
 from taic_jax.options.model import OptionModel
 from taic_jax.rl import normalize
 from taic_jax.rl.agent import Agent
-from taic_jax.rl.learner import empty_policy
+from taic_jax.rl.learner import learner_of
 from taic_jax.runtime.checkpoint import ArtifactError
 from taic_jax.runtime.files import DESCRIPTION
 
@@ -89,8 +89,8 @@ def _empty_agent(description: Description) -> Agent:
         hold = config.options.length if description.method == "repeat" else 1
         executor, settings = IdentityExecutor(body.action_size, hold), settings_of(config.collect)
     size = description.observation_size
-    policy, params = empty_policy(settings, executor.option_size, size, jax.random.key(0))
-    return Agent(executor, params, normalize.init((size,)), policy)
+    policy = learner_of(settings).make_policy(executor, settings)
+    return Agent(executor, policy.init(jax.random.key(0), size, 1.0), normalize.init((size,)), policy)
 
 
 def load_taic(source: str, env: Env, config: Config) -> tuple[OptionModel, Weights]:

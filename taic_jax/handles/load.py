@@ -41,7 +41,7 @@ class Handle:
     @cached_property
     def env(self) -> Env:
         """The task."""
-        from taic_jax.pipeline import make_envs  # its imports take a second, which an agent without its task need not
+        from taic_jax.pipeline import make_envs  # its imports take a second, and acting needs none
 
         with jax.ensure_compile_time_eval():  # its first use may be in a function that is traced
             return make_envs(dataclasses.replace(self.config, collect=CollectConfig()))[0]

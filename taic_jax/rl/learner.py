@@ -2,14 +2,12 @@
 
 from functools import partial
 from types import ModuleType
-from typing import Any
 
 import jax
 from jaxtyping import Array, Key
 
 from taic_jax.config import PPOConfig, SACConfig
 from taic_jax.envs.base import Env
-from taic_jax.networks import Policy, SquashedPolicy
 from taic_jax.options.execution import Executor
 from taic_jax.rl import ppo, sac
 from taic_jax.rl.agent import Agent
@@ -21,13 +19,6 @@ Settings = PPOConfig | SACConfig
 def learner_of(settings: Settings) -> ModuleType:
     """Return `ppo` or `sac`: modules with the functions `init`, `iterate`, `as_agent` and `make_policy`."""
     return sac if isinstance(settings, SACConfig) else ppo
-
-
-def empty_policy(settings: Settings, option_size: int, observation_size: int, key: Key[Array, ""]) -> tuple[Any, Any]:
-    """Return a policy and parameters of its structure, whose numbers are not meaningful."""
-    sizes = option_size, tuple(settings.hidden_sizes)
-    policy: Any = SquashedPolicy(*sizes) if isinstance(settings, SACConfig) else Policy(*sizes)
-    return policy, policy.init(key, observation_size, 1.0)
 
 
 def num_iterations(settings: Settings, ticks: int) -> int:

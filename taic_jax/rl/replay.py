@@ -73,7 +73,7 @@ def add(replay: Replay, transitions: Transition, chosen: Bool[Array, "T B"]) -> 
     rows = jax.vmap(lambda row: ravel_pytree(row)[0])(jax.tree.map(_flat, transitions))
     rank, capacity = jnp.cumsum(_flat(chosen), dtype=jnp.int32), len(replay.rows)
     place = jnp.where(_flat(chosen), (replay.count + rank - 1) % capacity, capacity)  # others are out of bounds
-    return Replay(replay.rows.at[place].set(rows, mode="drop", unique_indices=False), replay.count + rank[-1])
+    return Replay(replay.rows.at[place].set(rows, mode="drop"), replay.count + rank[-1])
 
 
 def sample(replay: Replay, key: Key[Array, ""], size: int, like: Transition) -> Transition:

@@ -153,7 +153,7 @@ class Checkpoints:
 
 def _begin(path: Path, arrays: dict[str, np.ndarray], extra: dict[str, Any]) -> Callable[[], None]:
     """Begin to write arrays and `extra` metadata to the folder `path`; return a function that waits for the end."""
-    from orbax.checkpoint import v1 as ocp  # its import takes half a second, which to load an agent need not
+    from orbax.checkpoint import v1 as ocp  # it takes half a second, and loading an agent needs none
 
     path.parent.mkdir(parents=True, exist_ok=True)
     if writes_here():
