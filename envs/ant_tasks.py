@@ -11,7 +11,7 @@ from jax import Array
 from jaxtyping import Bool, Float, Key
 
 from taic_jax.envs.arenas import ANT_QPOS, ANT_QVEL, Arena, furnish
-from taic_jax.envs.base import PhysicsState, State
+from taic_jax.envs.base import Goals, PhysicsState, State
 from taic_jax.envs.errors import UnknownNameError
 from taic_jax.envs.locomotion import Locomotion, Outcome
 from taic_jax.envs.rendering import render_mujoco
@@ -85,6 +85,22 @@ class AntArena(Locomotion):
         arena = copy.copy(self)
         arena.uniform_goal = False
         return arena
+
+    @property
+    def goals(self) -> Goals:
+        """Positions of the torso, with its height where the goal has one."""
+        first, size = self.proprioceptive_size, len(self.arena.goal)
+
+        def achieved(obs: Array) -> Array:
+            return jnp.append(obs[first : first + 2], obs[0] + self.arena.ground)[:size]
+
+        def aim(obs: Array, goal: Array) -> Array:
+            return obs.at[first + 2 : first + 2 + size].set(goal - achieved(obs))
+
+        def reward(achieved: Array, goal: Array) -> tuple[Array, Array]:
+            return -jnp.linalg.norm(goal - achieved), jnp.zeros((), bool)
+
+        return Goals(size, achieved, aim, reward)
 
     def reset(self, key: Key[Array, ""]) -> State:
         """Start near the origin with Gym's noise, the block at its place."""

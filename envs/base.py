@@ -1,7 +1,8 @@
 """The contracts of a task, `Env`, and of the physics behind it, `Physics`: pure unbatched functions on arrays."""
 
 import abc
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import mujoco
@@ -57,6 +58,15 @@ class State(struct.PyTreeNode):
         return cls(physics, obs, jnp.zeros(()), terminated=no, truncated=no, metrics=metrics)
 
 
+class Goals(NamedTuple):
+    """A task's goals [Q], from observations alone: an optional part of the contract, for hindsight."""
+
+    size: int  # Q
+    achieved: Callable[[Array], Array]  # obs [S] -> the goal that it achieves [Q]
+    aim: Callable[[Array, Array], Array]  # (obs [S], goal [Q]) -> the observation [S] with this goal
+    reward: Callable[[Array, Array], tuple[Array, Array]]  # (achieved [Q], goal [Q]) -> (reward, terminated) of a tick
+
+
 class Env(abc.ABC):
     """A task: unbatched and pure, so the caller applies `jax.vmap` and `jax.jit`."""
 
@@ -77,6 +87,11 @@ class Env(abc.ABC):
     def evaluated(self) -> "Env":
         """The task in evaluation: this one, without the draws of training alone."""
         return self
+
+    @property
+    def goals(self) -> Goals | None:
+        """How a tick's reward follows from a goal, if the task has goals and its observations tell them."""
+        return None
 
     @abc.abstractmethod
     def reset(self, key: Key[Array, ""]) -> State:

@@ -7,11 +7,12 @@ from flax import struct
 from jax import Array
 from jaxtyping import Bool, Float, Int, Key
 
-from taic_jax.envs.base import Env, State
+from taic_jax.envs.base import Env, Goals, State
 
 ROOM = 10.0  # m, side of the room
 MAX_SPEED = 1.0  # m/s on each axis
 GOAL_RADIUS = 0.5  # m
+REWARDS = np.float32(100), np.float32(-1)  # of a tick at the goal, and of any other
 _FLOOR, _WALL, _GOAL, _POINT = "#f4f1ea", "#3d4451", "#3a9d5d", "#d1495b"  # colours of its picture
 CELL = 0.1  # m, raster from which free points are drawn
 START, GOAL = (1.0, 5.0), (9.0, 5.0)  # m, of the task with fixed ends
@@ -89,9 +90,21 @@ class Navigation(Env):
         physics = state.physics.replace(position=jnp.stack([x, y]))
         metrics = self._metrics(physics)
         success = metrics["success"] > 0
-        reward = jnp.where(success, jnp.float32(100.0), jnp.float32(-1.0))
+        reward = jnp.where(success, *REWARDS)
         flags = {"terminated": success, "truncated": jnp.zeros((), bool)}
         return state.replace(physics=physics, obs=self._observe(physics), reward=reward, metrics=metrics, **flags)
+
+    @property
+    def goals(self) -> Goals | None:
+        """Positions, if the goal is observed."""
+        if not self.random_ends:
+            return None
+
+        def reward(achieved: Array, goal: Array) -> tuple[Array, Array]:
+            success = jnp.linalg.norm(goal - achieved) <= GOAL_RADIUS / (ROOM / 2)
+            return jnp.where(success, *REWARDS), success
+
+        return Goals(2, lambda obs: obs[:2], lambda obs, goal: jnp.concatenate([obs[:2], goal]), reward)
 
     def render(self, physics: NavigationState, *, height: int = 240, width: int = 320) -> np.ndarray:
         """Draw room, obstacles, start, goal, and the episode's path; a move too long for a tick is a reset."""

@@ -9,7 +9,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float, Key
 
-from taic_jax.envs.base import Env, State
+from taic_jax.envs.base import Env, Goals, State
 from taic_jax.envs.views import Views
 
 
@@ -28,6 +28,11 @@ class Wrapper(Env):
     def views(self) -> Views:
         """Views of the inner environment's body."""
         return self.env.views
+
+    @property
+    def goals(self) -> Goals | None:
+        """Goals of the inner environment."""
+        return self.env.goals
 
     @property
     def evaluated(self) -> Env:

@@ -253,6 +253,9 @@ def _check_learners(config: Config) -> None:
         if applies and learner != "ppo":
             raise impossible(name, learner, needed, "ppo")
     for name, sac in (("collect", config.collect.sac), ("train", train.sac)):
+        if sac.capacity < sac.num_envs:
+            expected = f"a transition for each of {name}.sac.num_envs = {sac.num_envs}"
+            raise impossible(f"{name}.sac.capacity", sac.capacity, expected, sac.num_envs)
         if sac.rollout_length % sac.update_every:
             valid = max(n for n in range(1, sac.update_every + 1) if sac.rollout_length % n == 0)
             expected = f"a divisor of {name}.sac.rollout_length = {sac.rollout_length}"

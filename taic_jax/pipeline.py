@@ -139,6 +139,10 @@ def make_envs(config: Config) -> tuple[Env, Env]:
     if config.options.length > (longest := env.episode_length):
         expected = f"at most the {longest} ticks of an episode of {env.name}"
         raise impossible("options.length", config.options.length, expected, longest)
+    for name, group, task in (("collect", config.collect, source), ("train", config.train, env)):
+        if group.learner == "sac" and group.sac.relabel and task.goals is None:
+            expected = "a task with goals in its observations, as nav2d_random and the arenas have"
+            raise impossible(f"{name}.sac.relabel", f"{group.sac.relabel} on {task.name}, which has none", expected, 0)
     return env, source
 
 

@@ -27,7 +27,8 @@ from taic_jax.envs.rendering import write_webp
 from taic_jax.nonfinite import FINITE, QUANTITIES
 from taic_jax.rl.agent import Agent
 from taic_jax.rl.learner import num_iterations
-from taic_jax.rl.replay import replay_bytes
+from taic_jax.rl.replay import row_size
+from taic_jax.rl.sac import goals_of
 from taic_jax.runtime.checkpoint import version_of
 from taic_jax.runtime.driver import Run, Stopped
 from taic_jax.runtime.files import atomic_file, json_safe, writes_here
@@ -67,12 +68,18 @@ def plan(config: Config, env: Env, source: Env) -> str:
 
 def replay_sizes(config: Config, env: Env, source: Env) -> dict[str, int]:
     """Return the bytes of SAC's replay buffers of all seeds, by the stage that has one."""
-    stages = (("collect", config.collect, source, env.action_size), ("train", config.train, env, config.options.size))
-    return {
-        name: config.seeds * replay_bytes(min(group.sac.capacity, group.ticks), task.observation_size, option_size)
-        for name, group, task, option_size in stages
-        if group.learner == "sac"
-    }
+    options = config.options
+    stages = (
+        ("collect", config.collect, source, env.action_size, 1),
+        ("train", config.train, env, options.size, options.length),
+    )
+    sizes = {}
+    for name, group, task, option_size, length in stages:
+        if group.learner == "sac":
+            goals = goals_of(group.sac, task)
+            row = row_size(task.observation_size, option_size, length, goals.size if goals else 0)
+            sizes[name] = 4 * row * min(group.sac.capacity, group.ticks) * config.seeds
+    return sizes
 
 
 def as_summary(run: Run, methods: Mapping[str, Trained]) -> Summary:

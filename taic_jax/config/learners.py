@@ -71,6 +71,11 @@ class SACConfig:
     """Widths of the hidden layers of actor and critics."""
     layer_norm: bool = True
     """Normalise the layers of the critics."""
+    relabel: Natural = 0
+    """Transitions with another goal for each one with its own, where the task has goals: one that is achieved later in
+    the episode (hindsight)."""
+    horizon: int = 50
+    """Most decisions between a transition and the later one whose achievement becomes its goal."""
     bound: Positive = 3.0
     """Greatest entry of an option code; an action's is 1."""
     learning_rate: float = 3e-4

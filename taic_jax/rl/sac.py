@@ -14,17 +14,17 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Key
 
 from taic_jax.config import SACConfig
-from taic_jax.envs.base import Env
+from taic_jax.envs.base import Env, Goals
 from taic_jax.envs.wrappers import AutoReset
 from taic_jax.networks import Critics, SquashedParams, SquashedPolicy
 from taic_jax.nonfinite import earliest, first_nonfinite
 from taic_jax.options.execution import Executor, IdentityExecutor
 from taic_jax.rl import normalize
 from taic_jax.rl.agent import Agent
-from taic_jax.rl.replay import Replay, Transition, add, complete, init_pending, sample
+from taic_jax.rl.replay import Replay, Transition, add, complete, init_pending, relabelled, sample
 from taic_jax.rl.replay import init as init_replay
 from taic_jax.rl.rollout import Rollout, RolloutCarry, pack_metrics, rollout, rollout_metrics, start
-from taic_jax.types import Scalar
+from taic_jax.types import Scalar, select
 
 TERMS = ("critic_loss", "actor_loss", "value", "entropy", "temperature")
 
@@ -72,20 +72,26 @@ def init(config: SACConfig, env: Env, executor: Executor, key: Key[Array, ""]) -
     key, key_actor, key_critics, key_envs = jax.random.split(key, 4)
     bound = 1.0 if isinstance(executor, IdentityExecutor) else config.bound
     actor = make_policy(executor, config).init(key_actor, env.observation_size, bound)
-    sizes = env.observation_size, executor.option_size
+    sizes, goals = (env.observation_size, executor.option_size), goals_of(config, env)
+    pending = init_pending(config.num_envs, *sizes, executor.length, goals.size if goals else 0)
     critics = make_critics(config).init(key_critics, *sizes)
     log_temperature = jnp.log(jnp.asarray(config.temperature, jnp.float32))
     optimizer = make_optimizer().init((actor.actor, critics, log_temperature))
     return SACState(
         learnt=Learnt(actor, critics, log_temperature, critics, optimizer),
         obs_statistics=normalize.init((env.observation_size,)),
-        replay=init_replay(config.capacity, *sizes),
-        pending=init_pending(config.num_envs, *sizes),
+        replay=init_replay(config.capacity, pending),
+        pending=pending,
         running=start(AutoReset(env), executor, config.num_envs, key_envs),
         owed=jnp.zeros(()),
         key=key,
         iteration=jnp.zeros((), jnp.int32),
     )
+
+
+def goals_of(config: SACConfig, env: Env) -> Goals | None:
+    """Return the goals of the task for hindsight, or None without it."""
+    return env.goals if config.relabel else None
 
 
 def as_agent(config: SACConfig, executor: Executor, state: SACState) -> Agent:
@@ -119,12 +125,13 @@ def _round(
     seen = state.iteration * config.rollout_length * config.num_envs
     warm = seen >= config.warmup
     running, ticks = collect(config, env, executor, state, warm, key_rollout)
-    pending, transitions = complete(state.pending, ticks, config.gamma)
+    goals = goals_of(config, env)
+    pending, transitions = complete(state.pending, ticks, config.gamma, goals)
     replay = add(state.replay, transitions, ticks.ended)
     owed = state.owed + jnp.where(warm, config.updates_per_decision * jnp.sum(ticks.ended, dtype=jnp.float32), 0.0)
     statistics = normalize.update(state.obs_statistics, ticks.obs)
     state = state.replace(obs_statistics=statistics, replay=replay, pending=pending, running=running)
-    learnt, terms = improve(config, executor, state, jnp.floor(owed), key_update)
+    learnt, terms = improve(config, goals, executor, state, jnp.floor(owed), key_update)
     code = first_nonfinite(
         action=ticks.action, physics=running.env.physics, observation=(ticks.obs, ticks.final_obs),
         reward=ticks.reward, loss=terms, gradient=learnt,
@@ -147,13 +154,19 @@ def collect(
 
 
 def improve(
-    config: SACConfig, executor: Executor, state: SACState, count: Float[Array, ""], key: Key[Array, ""]
-) -> tuple[Learnt, Float[Array, "5"]]:
+    config: SACConfig, goals: Goals | None, executor: Executor, state: SACState, count: Float[Array, ""],
+    key: Key[Array, ""],
+) -> tuple[Learnt, Float[Array, "5"]]:  # fmt: skip
     """Take `count` gradient steps; return what is learnt and the mean terms, of zero for no step."""
 
     def step(index: Any, carry: tuple[Learnt, Array]) -> tuple[Learnt, Array]:
-        key_sample, key_options = jax.random.split(jax.random.fold_in(key, index))
-        batch = sample(state.replay, key_sample, config.batch_size, state.pending)
+        key_sample, key_goal, key_options = jax.random.split(jax.random.fold_in(key, index), 3)
+        horizon = config.horizon if goals else 0
+        batch, later = sample(state.replay, key_sample, config.batch_size, state.pending, horizon)
+        if goals:
+            share = config.relabel / (config.relabel + 1)
+            chosen = jax.random.bernoulli(key_goal, share, (config.batch_size,))
+            batch = select(chosen, relabelled(batch, later, config.gamma, goals), batch)
         obs, next_obs = (normalize.normalize(state.obs_statistics, x) for x in (batch.obs, batch.next_obs))
         learnt, terms = update(config, executor, carry[0], batch.replace(obs=obs, next_obs=next_obs), key_options)
         return learnt, carry[1] + terms

@@ -50,7 +50,8 @@ def learnt():
     actor, params = policy.init(jax.random.key(0), S, 3.0), critics.init(jax.random.key(1), S, D)
     scatter = partial(jax.tree.map, lambda x: draw(rng, *x.shape))
     values = actor.replace(actor=scatter(actor.actor)), scatter(params), jnp.log(0.5), scatter(params)
-    batch = Transition(draw(rng, M, S), draw(rng, M, D), draw(rng, M), jnp.abs(draw(rng, M)), draw(rng, M, S))
+    more = jnp.zeros((M, 1, 0)), jnp.ones(M), jnp.zeros(M)
+    batch = Transition(draw(rng, M, S), draw(rng, M, D), draw(rng, M), jnp.abs(draw(rng, M)), draw(rng, M, S), *more)
     return config, policy, critics, sac.Learnt(*values, None), batch, draw(rng, 2, M, D)
 
 
@@ -110,7 +111,7 @@ def test_the_number_of_gradient_steps_is_that_of_decisions_after_the_warm_up(eve
         state, _, ticks = step(state)
         ended += int(ticks.ended.sum())
         learnt_from += int(ticks.ended.sum()) if iteration * 128 >= CONFIG.warmup else 0
-        assert state.replay.count == ended
+        assert state.replay.count.sum() == ended
         assert int(state.learnt.optimizer.count) == math.floor(every * learnt_from + 1e-3)
     assert learnt_from > 100
 
