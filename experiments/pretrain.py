@@ -17,7 +17,7 @@ import tyro
 from taic_jax.artifacts.models import AGENTS
 from taic_jax.command_line import tell
 from taic_jax.config import COLLECT, TAIC, Config, ConfigError, experience_ticks, replace
-from taic_jax.config_io import load_config, nearest
+from taic_jax.config.files import load_config, nearest
 from taic_jax.pipeline import run_pipeline
 from taic_jax.runtime.files import save_json
 from taic_jax.runtime.program_cache import keep_programs

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
         OptionsConfig,
         TrainConfig,
     )
+    from taic_jax.config.files import load_config
     from taic_jax.config.learners import PPOConfig, SACConfig
-    from taic_jax.config_io import load_config
     from taic_jax.envs import AutoReset, Env, State, environment_names, make_env
     from taic_jax.envs.adapters import to_gymnasium
     from taic_jax.handles.load import Handle, load
@@ -44,7 +44,7 @@ _MODULES = {
     "analysis.statistics": "bootstrap_interval iqm",
     "config": "CollectConfig Config EnvConfig EvaluateConfig FineTuneConfig OptionsConfig TrainConfig",
     "config.learners": "PPOConfig SACConfig",
-    "config_io": "load_config",
+    "config.files": "load_config",
     "envs": "AutoReset Env State environment_names make_env",
     "envs.adapters": "to_gymnasium",
     "artifacts.demonstrations": "read_demonstrations",

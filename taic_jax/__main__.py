@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from taic_jax import __version__
 from taic_jax.command_line import tell
 from taic_jax.config import ConfigError
-from taic_jax.config_io import nearest
+from taic_jax.config.files import nearest
 
 # A command's module, imported once it is called, and its line in the help.
 COMMANDS = {

@@ -25,7 +25,8 @@ import tyro
 
 from taic_jax import __version__
 from taic_jax.config import Config, ConfigError, Shard, Track, field_types, impossible, replace, walk
-from taic_jax.config_io import as_integer, load_config, mistyped, nearest, preset_names, validate
+from taic_jax.config.checks import validate
+from taic_jax.config.files import as_integer, load_config, mistyped, nearest, preset_names
 from taic_jax.runtime.files import SaveError
 from taic_jax.runtime.signals import DivergedError, Interrupted, Signals
 

@@ -12,7 +12,7 @@ import tyro
 from taic_jax import command_line
 from taic_jax.command_line import FAILED, answer, attempt
 from taic_jax.config import ConfigError, impossible
-from taic_jax.config_io import differences
+from taic_jax.config.files import differences
 from taic_jax.runtime.signals import Signals
 
 PROGRAM = "python -m taic_jax.run"

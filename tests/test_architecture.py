@@ -17,7 +17,7 @@ ALL = PACKAGE + sorted((ROOT / "tests").rglob("*.py"))
 # A module imports only from its own layer or from earlier ones. A module that is in none fails the test.
 LAYERS = (
     "envs",
-    "config config_io types",
+    "config types",
     "networks nonfinite",
     "runtime",
     "options",
@@ -25,7 +25,7 @@ LAYERS = (
     "artifacts",
     "analysis",
     "trainer",
-    "summary",
+    "summary sources",
     "pipeline",
     "handles command_line",
     "run sweep",

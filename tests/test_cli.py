@@ -12,7 +12,7 @@ import pytest
 
 from taic_jax import __version__, command_line, run
 from taic_jax.config import CONFIG_CLASSES, Config, ConfigError
-from taic_jax.config_io import load_config, to_yaml
+from taic_jax.config.files import load_config, to_yaml
 from taic_jax.run import PROGRAM, Command, main
 from taic_jax.runtime.checkpoint import ArtifactError
 from taic_jax.runtime.signals import Interrupted

@@ -15,7 +15,8 @@ from hypothesis import strategies as st
 
 from taic_jax import config as config_module
 from taic_jax.config import CONFIG_CLASSES, Config, ConfigError, PPOConfig, replace, walk
-from taic_jax.config_io import closest, load_config, to_yaml, validate
+from taic_jax.config.checks import validate
+from taic_jax.config.files import closest, load_config, to_yaml
 from taic_jax.types import as_arrays
 
 

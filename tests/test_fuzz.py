@@ -17,7 +17,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from taic_jax.config import Config, walk
-from taic_jax.config_io import preset_names
+from taic_jax.config.files import preset_names
 from taic_jax.run import main
 
 FIELDS = [name for name, _ in walk(Config())]

@@ -21,7 +21,7 @@ from tiny_runs import (
 import taic_jax as taic
 from taic_jax.artifacts.experience import ExperienceStore
 from taic_jax.config import ConfigError
-from taic_jax.config_io import validate
+from taic_jax.config.checks import validate
 from taic_jax.run import main
 from taic_jax.runtime.checkpoint import Checkpoints
 from taic_jax.summary import plan
@@ -126,7 +126,7 @@ def test_a_buffer_larger_than_the_memory_is_refused_with_the_nearest_that_fits(c
         (line,) = capsys.readouterr().err.splitlines()
         assert "train.sac.capacity: expected a buffer within the memory" in line and not (tmp_path / "run").exists()
     fits = int(line.rpartition(" ")[2])
-    bytes_ = 4 * fits * (2 * taic.make_env("nav2d").observation_size + 6 + 2)
+    bytes_ = 4 * fits * (2 * taic.make_env("nav2d").observation_size + 6 + 4)
     assert 0.45 < bytes_ / psutil.virtual_memory().total < 0.55
 
 

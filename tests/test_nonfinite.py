@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from tiny_runs import CONFIG, rows_of, tiny_steps, with_fields
 
-from taic_jax.config_io import to_yaml
+from taic_jax.config.files import to_yaml
 from taic_jax.nonfinite import FINITE, QUANTITIES, begin, earliest, first_nonfinite, guarded
 from taic_jax.run import main
 

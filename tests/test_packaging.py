@@ -108,9 +108,10 @@ def test_the_wheel_runs_away_from_the_checkout(built, tmp_path):
     zipfile.ZipFile(wheel).extractall(tmp_path / "site")
     code = """
 import sys; sys.path.insert(0, "site")
-import taic_jax, taic_jax.run, taic_jax.config_io
+import taic_jax, taic_jax.run, taic_jax.config.files
 assert taic_jax.__file__.startswith(sys.argv[1]), taic_jax.__file__
-print(taic_jax.config_io.preset_names(), taic_jax.command_line.parse(["ant"], "", taic_jax.run.Command).config.env.name)
+names = taic_jax.config.files.preset_names()
+print(names, taic_jax.command_line.parse(["ant"], "", taic_jax.run.Command).config.env.name)
 """
     done = python("-I", "-c", code.replace('"site"', repr(str(tmp_path / "site"))), str(tmp_path), cwd=tmp_path)
     assert done.returncode == 0, done.stderr

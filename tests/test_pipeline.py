@@ -32,14 +32,15 @@ from tiny_runs import (
 from taic_jax import pipeline
 from taic_jax.artifacts.experience import ExperienceStore, read_experience
 from taic_jax.config import Config, ConfigError
-from taic_jax.config_io import load_config
+from taic_jax.config.files import load_config
 from taic_jax.envs import make_env
 from taic_jax.options.dataset import Experience
-from taic_jax.pipeline import make_envs, run_pipeline
+from taic_jax.pipeline import run_pipeline
 from taic_jax.runtime import driver
 from taic_jax.runtime.checkpoint import Checkpoints, load_arrays
 from taic_jax.runtime.logging import RunLogger
 from taic_jax.runtime.run_folder import BusyError, RunFolder, RunFolderError
+from taic_jax.sources import make_envs
 from taic_jax.trainer import init_rows, make_trainer
 from taic_jax.types import as_rows
 

@@ -9,7 +9,8 @@ from tiny_runs import with_fields
 
 import taic_jax
 from taic_jax.config import Config, ConfigError, walk
-from taic_jax.config_io import load_config, preset_names, to_yaml, validate
+from taic_jax.config.checks import validate
+from taic_jax.config.files import load_config, preset_names, to_yaml
 
 
 def write(tmp_path: Path, text: str) -> Path:

@@ -21,9 +21,10 @@ from tiny_runs import (
 
 from taic_jax import nonfinite, pipeline
 from taic_jax.config import Config, ConfigError, collector_is_baseline, needs_collect
-from taic_jax.pipeline import make_envs, run_pipeline
+from taic_jax.pipeline import run_pipeline
 from taic_jax.runtime.checkpoint import Checkpoints
 from taic_jax.runtime.driver import STAGE_STREAMS
+from taic_jax.sources import make_envs, take_over
 from taic_jax.summary import plan
 
 QUIET = with_fields(CONFIG, evaluate__video_ticks=0)
@@ -104,7 +105,7 @@ def test_the_transferred_policy_starts_where_the_source_run_ended(source, tmp_pa
         return state
 
     env = make_envs(config)[0]
-    policy = pipeline.take_over(config, env, env).flat
+    policy = take_over(config, env, env).flat
     monkeypatch.setattr(pipeline, "drive", drive)
     with pipeline.Run.open(config, tmp_path) as run:
         pipeline.train_baseline(run, env, "transfer", policy)

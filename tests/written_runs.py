@@ -13,7 +13,7 @@ from taic_jax.analysis.statistics import summarize
 from taic_jax.artifacts.experience import EXPERIENCE, ExperienceStore
 from taic_jax.artifacts.models import OPTIONS, describe, save_options
 from taic_jax.config import Config
-from taic_jax.config_io import to_yaml
+from taic_jax.config.files import to_yaml
 from taic_jax.envs import make_env
 from taic_jax.experiments.evidence.table import append_row
 from taic_jax.options.dataset import Experience

@@ -7,7 +7,7 @@ import tempfile
 from pathlib import Path
 
 from taic_jax.config import replace
-from taic_jax.config_io import load_config, preset_names
+from taic_jax.config.files import load_config, preset_names
 from taic_jax.handles.calibration import calibrate
 from taic_jax.runtime.program_cache import keep_programs
 

@@ -16,7 +16,7 @@ import jax
 
 from taic_jax import envs
 from taic_jax.config import ConfigError, OptionsConfig, PPOConfig
-from taic_jax.config_io import load_config, preset_names
+from taic_jax.config.files import load_config, preset_names
 from taic_jax.experiments.benchmark import loops, peers
 from taic_jax.experiments.benchmark.command import Command, answer, show
 from taic_jax.experiments.benchmark.loops import Training

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from taic_jax.config import Config, FineTuneConfig, OptionsConfig, replace
-from taic_jax.config_io import load_config
+from taic_jax.config.files import load_config
 
 ROBOTS = ("half_cheetah", "ant", "hopper", "walker2d")
 TRANSFERS = ("ant_turn", "ant_maze", "ant_push", "ant_fall")

@@ -28,7 +28,7 @@ from safetensors.numpy import load_file
 from taic_jax.artifacts.models import ARRAYS
 from taic_jax.command_line import tell
 from taic_jax.config import CollectConfig, Config, EnvConfig, EvaluateConfig, OptionsConfig, PPOConfig, TrainConfig
-from taic_jax.config_io import to_yaml
+from taic_jax.config.files import to_yaml
 from taic_jax.runtime.checkpoint import load_arrays
 from taic_jax.runtime.run_folder import RunFolder
 

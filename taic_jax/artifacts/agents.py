@@ -23,7 +23,7 @@ from taic_jax.artifacts.models import (
 )
 from taic_jax.artifacts.pretrained import locate
 from taic_jax.config import COLLECT, TAIC, Config, ConfigError, PPOConfig, settings_of
-from taic_jax.config_io import from_mapping
+from taic_jax.config.files import from_mapping
 from taic_jax.envs.base import Env
 from taic_jax.networks import PolicyParams
 from taic_jax.options.execution import Executor, IdentityExecutor, make_executor

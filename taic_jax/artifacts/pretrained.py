@@ -3,7 +3,7 @@
 from importlib import resources
 from pathlib import Path
 
-from taic_jax.config_io import nearest
+from taic_jax.config.files import nearest
 from taic_jax.runtime.checkpoint import ArtifactError
 
 PREFIX = "pretrained:"

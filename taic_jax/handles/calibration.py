@@ -9,10 +9,11 @@ import psutil
 from taic_jax.artifacts.experience import experience_bytes
 from taic_jax.config import Config, ConfigError, Shard, experience_ticks, needs_collect, replace, settings_of
 from taic_jax.options.dataset import HELD_OUT_EVERY, STRETCH
-from taic_jax.pipeline import make_envs, run_pipeline
+from taic_jax.pipeline import run_pipeline
 from taic_jax.runtime.logging import count_of
 from taic_jax.runtime.run_folder import RunFolder
 from taic_jax.runtime.signals import DivergedError
+from taic_jax.sources import make_envs
 
 STEPS = 4
 

@@ -10,7 +10,8 @@ import tyro
 
 from taic_jax.command_line import tell, typed
 from taic_jax.config import COLLECT, ConfigError, EnvConfig, impossible
-from taic_jax.config_io import nearest, validate
+from taic_jax.config.checks import validate
+from taic_jax.config.files import nearest
 
 if TYPE_CHECKING:  # it imports JAX, without which the command lines answer
     from taic_jax.handles.load import Handle

@@ -4,7 +4,7 @@ import re
 from collections.abc import Iterable, Sequence
 
 from taic_jax.config import ConfigError, field_types
-from taic_jax.config_io import nearest, preset_names
+from taic_jax.config.files import nearest, preset_names
 from taic_jax.handles import assess, explore, export, pictures, play
 
 BASH = """_taic() {

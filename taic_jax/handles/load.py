@@ -13,7 +13,7 @@ from taic_jax.artifacts.agents import load_agents, read_agents
 from taic_jax.artifacts.models import AGENTS, STRUCTURE, load_options, read_body
 from taic_jax.artifacts.pretrained import locate
 from taic_jax.config import TAIC, CollectConfig, Config
-from taic_jax.config_io import from_mapping
+from taic_jax.config.files import from_mapping
 from taic_jax.envs.base import Env
 from taic_jax.options.model import OptionModel
 from taic_jax.rl.agent import Agent
@@ -41,7 +41,7 @@ class Handle:
     @cached_property
     def env(self) -> Env:
         """The task."""
-        from taic_jax.pipeline import make_envs  # its imports take a second, and acting needs none
+        from taic_jax.sources import make_envs  # its imports take a second, and acting needs none
 
         with jax.ensure_compile_time_eval():  # its first use may be in a function that is traced
             return make_envs(dataclasses.replace(self.config, collect=CollectConfig()))[0]

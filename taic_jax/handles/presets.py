@@ -6,7 +6,7 @@ from importlib import resources
 
 from taic_jax.command_line import tell
 from taic_jax.config import ConfigError
-from taic_jax.config_io import load_config, preset_names, preset_text
+from taic_jax.config.files import load_config, preset_names, preset_text
 
 
 def main(args: Sequence[str]) -> int:

@@ -12,11 +12,12 @@ from taic_jax.artifacts.models import load_options
 from taic_jax.config import COLLECT, replace
 from taic_jax.envs.base import Env
 from taic_jax.nonfinite import FINITE, QUANTITIES
-from taic_jax.pipeline import make_envs, select_windows, take_over
+from taic_jax.pipeline import select_windows
 from taic_jax.runtime.checkpoint import ArtifactError, load_tree
 from taic_jax.runtime.driver import Run
 from taic_jax.runtime.files import read_description
 from taic_jax.runtime.run_folder import RunFolder
+from taic_jax.sources import make_envs, take_over
 from taic_jax.trainer import init_learning, init_rows, learn_rows, make_trainer, step_rows
 from taic_jax.types import as_arrays
 

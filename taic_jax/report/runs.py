@@ -12,7 +12,7 @@ import numpy as np
 import yaml
 
 from taic_jax.config import COLLECT, Config, ConfigError
-from taic_jax.config_io import closest
+from taic_jax.config.files import closest
 from taic_jax.runtime.run_folder import Row, RunFolder
 
 

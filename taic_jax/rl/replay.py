@@ -68,8 +68,9 @@ def complete(
         fresh = running.replace(obs=now.obs, option=now.option, reward=zeros, discount=zeros + 1.0, ticks=zeros)
         running = select(now.decision, fresh, running)
         if goals is not None:
-            put = jax.vmap(lambda trail, obs, tick: trail.at[tick].set(goals.achieved(obs)))
-            running = running.replace(trail=put(running.trail, now.final_obs, running.ticks.astype(jnp.int32)))
+            put = jax.vmap(lambda trail, tick, goal: trail.at[tick].set(goal))
+            achieved = jax.vmap(goals.achieved)(now.final_obs)
+            running = running.replace(trail=put(running.trail, running.ticks.astype(jnp.int32), achieved))
         running = running.replace(
             reward=running.reward + running.discount * now.reward,
             discount=gamma * running.discount,

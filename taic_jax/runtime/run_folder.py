@@ -11,7 +11,7 @@ from typing import Any, TypedDict
 import filelock
 
 from taic_jax.config import COLLECT, Config, walk
-from taic_jax.config_io import load_config, to_yaml
+from taic_jax.config.files import load_config, to_yaml
 from taic_jax.runtime.files import PARTIAL, SaveError, remove_partial, save_text, writes_here, writing
 from taic_jax.runtime.hosts import agree
 

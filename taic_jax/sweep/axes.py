@@ -8,7 +8,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from taic_jax.config import Config, ConfigError, field_types, replace, walk
-from taic_jax.config_io import from_text, nearest, validate
+from taic_jax.config.checks import validate
+from taic_jax.config.files import from_text, nearest
 
 RANGE = ".."
 STATIC_FLOATS = "env."  # prefix of numbers that are constants of a program: environments are made outside of it

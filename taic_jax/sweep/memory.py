@@ -11,7 +11,7 @@ import psutil
 from taic_jax.artifacts.experience import experience_bytes, num_blocks
 from taic_jax.config import Config, ConfigError, experience_ticks, needs_collect, settings_of
 from taic_jax.options.dataset import Experience, make_dataset
-from taic_jax.pipeline import make_envs
+from taic_jax.sources import make_envs
 from taic_jax.trainer import init_rows, make_trainer, step_rows
 from taic_jax.types import as_rows
 

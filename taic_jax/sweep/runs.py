@@ -14,7 +14,7 @@ import numpy as np
 from taic_jax.analysis.statistics import bootstrap_interval, iqm
 from taic_jax.artifacts.experience import EXPERIENCE
 from taic_jax.config import Config, Track, replace
-from taic_jax.config_io import to_yaml
+from taic_jax.config.files import to_yaml
 from taic_jax.pipeline import run_pipeline
 from taic_jax.runtime.files import save_json, save_table, save_text
 from taic_jax.runtime.pbt import Population, schedule

@@ -12,8 +12,8 @@ import taic_jax as taic
 from taic_jax.analysis.evaluate import evaluate
 from taic_jax.artifacts.pretrained import locate, pretrained_names
 from taic_jax.config import TAIC, EnvConfig, replace
-from taic_jax.pipeline import make_envs, take_over
 from taic_jax.runtime.checkpoint import ArtifactError
+from taic_jax.sources import make_envs, take_over
 
 PAGE = Path(__file__).parents[2] / "docs/use.md"
 

@@ -12,7 +12,7 @@ from tiny_runs import CONFIG, files_of, last_state, tiny_steps, with_fields
 from taic_jax.artifacts.experience import ExperienceStore
 from taic_jax.artifacts.models import describe
 from taic_jax.config import Config
-from taic_jax.config_io import to_yaml
+from taic_jax.config.files import to_yaml
 from taic_jax.envs import make_env
 from taic_jax.options import learning
 from taic_jax.options.dataset import Experience

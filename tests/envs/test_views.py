@@ -9,12 +9,12 @@ import pytest
 from probes import draw
 
 from taic_jax.config import ConfigError, OptionsConfig
-from taic_jax.config_io import load_config
+from taic_jax.config.files import load_config
 from taic_jax.envs import Env, make_env
 from taic_jax.envs.views import make_views, one_view
 from taic_jax.options.dataset import Experience, gather, make_dataset
 from taic_jax.options.learning import learn
-from taic_jax.pipeline import make_envs
+from taic_jax.sources import make_envs
 from taic_jax.types import as_arrays
 
 VIEWS = make_views(((1, -1), (0, 1)), ((1, 1), (2, 1), (0, 1)), 3)

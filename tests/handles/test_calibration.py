@@ -7,7 +7,7 @@ from tiny_runs import CONFIG, tiny_steps, with_fields
 
 from taic_jax import run
 from taic_jax.config import ConfigError
-from taic_jax.config_io import preset_names, to_yaml
+from taic_jax.config.files import preset_names, to_yaml
 from taic_jax.experiments.benchmark import presets
 from taic_jax.handles import calibration
 from taic_jax.handles.calibration import Cost, calibrate

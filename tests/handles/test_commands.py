@@ -16,7 +16,7 @@ from tiny_runs import CONFIG, files_of, with_fields
 import taic_jax as taic
 from taic_jax.__main__ import COMMANDS, main
 from taic_jax.command_line import COMMON_FIELDS
-from taic_jax.config_io import preset_names
+from taic_jax.config.files import preset_names
 from taic_jax.envs.locomotion import Locomotion
 from taic_jax.handles import assess, play
 from taic_jax.handles.play import MARK, with_label, with_options

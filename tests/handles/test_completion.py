@@ -6,7 +6,7 @@ import subprocess
 import pytest
 
 from taic_jax.__main__ import COMMANDS, main
-from taic_jax.config_io import preset_names
+from taic_jax.config.files import preset_names
 
 LINES = {
     "": " ".join(COMMANDS),

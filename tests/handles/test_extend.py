@@ -10,7 +10,7 @@ from tiny_runs import CONFIG, KilledError, assert_same_arrays, die, last_state, 
 
 import taic_jax as taic
 from taic_jax.config import ConfigError
-from taic_jax.config_io import validate
+from taic_jax.config.checks import validate
 from taic_jax.runtime.checkpoint import ArtifactError, Checkpoints
 from taic_jax.runtime.driver import STAGE_STREAMS
 from taic_jax.runtime.run_folder import RunFolder, RunFolderError

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from tiny_runs import CONFIG, SLOPE, KilledError, die, last_state, rows_of, tiny_steps, with_fields
 
-from taic_jax.config_io import to_yaml
+from taic_jax.config.files import to_yaml
 from taic_jax.envs import PhysicsState, make_env
 from taic_jax.envs.physics.mujoco import num_physical_cores
 from taic_jax.run import main

@@ -9,7 +9,7 @@ import pytest
 from tiny_runs import CONFIG, assert_same_arrays, last_state, rows_of, tiny_steps
 
 from taic_jax import pipeline
-from taic_jax.config_io import to_yaml
+from taic_jax.config.files import to_yaml
 from taic_jax.run import main
 from taic_jax.runtime.checkpoint import Checkpoints
 from taic_jax.runtime.files import PARTIAL, TEMPORARY

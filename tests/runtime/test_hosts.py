@@ -12,7 +12,7 @@ import pytest
 from test_devices import assert_same_run
 from tiny_runs import CONFIG, SLOPE, with_fields
 
-from taic_jax.config_io import to_yaml
+from taic_jax.config.files import to_yaml
 from taic_jax.run import main
 from taic_jax.runtime import hosts
 

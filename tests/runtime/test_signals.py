@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from tiny_runs import CONFIG, tiny_steps
 
-from taic_jax.config_io import to_yaml
+from taic_jax.config.files import to_yaml
 from taic_jax.run import main
 from taic_jax.runtime import driver
 from taic_jax.runtime.checkpoint import Checkpoints, load_arrays

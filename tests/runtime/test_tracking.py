@@ -11,7 +11,7 @@ from tiny_runs import CONFIG, KilledError, die, with_fields
 
 from taic_jax import run
 from taic_jax.config import Config, ConfigError, walk
-from taic_jax.config_io import to_yaml
+from taic_jax.config.files import to_yaml
 from taic_jax.envs.errors import MissingExtraError
 from taic_jax.runtime import tracking
 from taic_jax.runtime.logging import RunLogger

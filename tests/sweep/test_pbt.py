@@ -11,7 +11,7 @@ from test_sweep import FEW, table_of
 from tiny_runs import CONFIG, SLOPE, KilledError, die, tiny_steps, with_fields
 
 from taic_jax.config import Config, replace
-from taic_jax.config_io import load_config, to_yaml
+from taic_jax.config.files import load_config, to_yaml
 from taic_jax.nonfinite import FINITE
 from taic_jax.runtime.checkpoint import Checkpoints
 from taic_jax.runtime.pbt import Population, schedule

@@ -13,7 +13,7 @@ from PIL import Image
 from tiny_runs import CONFIG, SLOPE, KilledError, die, tiny_steps, with_fields
 
 from taic_jax.config import Config, ConfigError
-from taic_jax.config_io import load_config, to_yaml
+from taic_jax.config.files import load_config, to_yaml
 from taic_jax.run import main as run
 from taic_jax.runtime.checkpoint import Checkpoints
 from taic_jax.sweep import runs

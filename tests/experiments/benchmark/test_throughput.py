@@ -11,7 +11,7 @@ from tiny_runs import CONFIG, with_fields
 
 from taic_jax import envs
 from taic_jax.config import PPOConfig
-from taic_jax.config_io import to_yaml
+from taic_jax.config.files import to_yaml
 from taic_jax.experiments.benchmark import peers, processes, throughput
 from taic_jax.experiments.benchmark.loops import WORK, Training, options_config
 from taic_jax.experiments.benchmark.peers import brax_ppo

@@ -1,4 +1,4 @@
-"""Configurations from YAML and back, and their checks; a file holds its differences from the defaults or its base."""
+"""Configurations from YAML and back; a file holds its differences from the defaults or its base."""
 
 import contextlib
 import dataclasses
@@ -6,13 +6,12 @@ import difflib
 import math
 from collections.abc import Iterable
 from importlib import resources
-from operator import ge, le
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import yaml
 
-from taic_jax.config import USUAL_BOUNDS, Config, ConfigError, field_types, impossible, walk
+from taic_jax.config import Config, ConfigError, field_types
 
 _PRESETS = resources.files("taic_jax.experiments") / "presets"
 BASE = "base"
@@ -214,83 +213,3 @@ def _coerce(name: str, kind: Any, value: Any) -> Any:
 def _show(value: Any) -> str:
     text = "nothing" if value is None else repr(value)
     return text if len(text) <= 60 else f"{text[:57]}..."
-
-
-def validate(config: Config) -> None:
-    """Raise `ConfigError` at the first impossible value, naming field, value, expectation and nearest."""
-    types = field_types(bounds=True)
-    for name, value in walk(config):
-        _check_bounds(name, types[name], value)
-    _check_limits(config)
-    options, baselines = config.options, config.train.baselines
-    if options.source and options.experience:
-        raise impossible("options.experience", list(options.experience), "none with options.source")
-    if options.delta_unit == "quantile" and options.delta > 1:
-        raise impossible("options.delta", options.delta, "at most 1, being a quantile", 1.0)
-    if options.delta_unit == "quantile" and options.termination == "predict" and not options.steps:
-        expected = "error with options.steps 0, where no error of P was measured"
-        raise impossible("options.delta_unit", "quantile", expected, "error")
-    if options.since >= options.until:
-        raise impossible("options.since", options.since, f"less than options.until = {options.until}", 0.0)
-    if config.train.init and config.train.init != options.source:
-        raise impossible(
-            "options.source", repr(options.source), "the run that train.init names", repr(config.train.init)
-        )
-    _check_learners(config)
-    if "transfer" in baselines and not options.source:
-        expected = "with transfer a run with options and a flat policy"
-        raise impossible("train.baselines", "none: add --options RUN", expected)
-
-
-def _check_learners(config: Config) -> None:
-    """Check that each learner does all that is asked of it, and that SAC's rounds divide its iteration."""
-    train, flat = config.train, config.collect.learner
-    for applies, name, learner, needed in (
-        (train.fine_tune.epochs, "train.learner", train.learner, "ppo with train.fine_tune.epochs"),
-        (train.init, "train.learner", train.learner, "ppo with train.init"),
-        ("transfer" in train.baselines, "collect.learner", flat, "ppo with baseline transfer"),
-    ):
-        if applies and learner != "ppo":
-            raise impossible(name, learner, needed, "ppo")
-    for name, sac in (("collect", config.collect.sac), ("train", train.sac)):
-        if sac.capacity < sac.num_envs:
-            expected = f"a transition for each of {name}.sac.num_envs = {sac.num_envs}"
-            raise impossible(f"{name}.sac.capacity", sac.capacity, expected, sac.num_envs)
-        if sac.rollout_length % sac.update_every:
-            valid = max(n for n in range(1, sac.update_every + 1) if sac.rollout_length % n == 0)
-            expected = f"a divisor of {name}.sac.rollout_length = {sac.rollout_length}"
-            raise impossible(f"{name}.sac.update_every", sac.update_every, expected, valid)
-
-
-def _check_bounds(name: str, kind: Any, value: Any) -> None:
-    if kind == tuple[int, ...] and not value:
-        raise impossible(name, "none", "at least one size", 64)
-    bounds = get_args(kind)[1] if get_origin(kind) is Annotated else USUAL_BOUNDS.get(kind)
-    for number in value if isinstance(value, tuple) else (value,):
-        if bounds and not (math.isfinite(number) and bounds.low <= number <= bounds.high):
-            interval = f"at least {bounds.low}" if bounds.high == math.inf else f"in [{bounds.low}, {bounds.high}]"
-            nearest_valid = bounds.high if number >= bounds.low else bounds.low
-            raise impossible(name, value, f"a finite number {interval}", nearest_valid)
-
-
-def _check_limits(config: Config) -> None:
-    """Check the fields whose bounds are other fields, or products of them."""
-    values, baselines = dict(walk(config)), config.train.baselines
-    flat, over_options = f"collect.{config.collect.learner}", f"train.{config.train.learner}"
-    collected, trained = (f"{x}.num_envs * {x}.rollout_length" for x in (flat, over_options))
-    by_ppo = over_options == "train.ppo"
-    for applies, name, allowed, expected, other in (
-        (flat == "collect.ppo", "collect.ppo.minibatch_size", le, "at most", collected),
-        (True, "collect.ticks", ge, "at least one iteration,", collected),
-        (by_ppo, "train.ppo.minibatch_size", le, "at most", trained),
-        *((True, f"{x}.sac.update_every", le, "at most", f"{x}.sac.rollout_length") for x in ("collect", "train")),
-        (config.train.fine_tune.epochs, "train.fine_tune.minibatch_size", le, "at most", trained),
-        (True, "train.ticks", ge, "at least one iteration,", trained),
-        (by_ppo, "options.length", le, "at most", "train.ppo.rollout_length"),
-        (True, "options.shortest", le, "at most", "options.length"),
-        ("repeat" in baselines, "options.length", le, "with baseline repeat at most", f"{flat}.rollout_length"),
-        (baselines, "train.ticks", ge, "at least an iteration of baselines,", collected),
-    ):
-        limit = math.prod(values[factor] for factor in other.split(" * "))
-        if applies and not allowed(values[name], limit):
-            raise impossible(name, values[name], f"{expected} {other} = {limit}", limit)

@@ -1,0 +1,96 @@
+"""All that a run starts from: its environments, and the parts that it takes from another run."""
+
+import dataclasses
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import psutil
+
+from taic_jax.artifacts.agents import Weights, load_policy, load_taic
+from taic_jax.artifacts.experience import gather_experience
+from taic_jax.artifacts.models import describe, load_options
+from taic_jax.config import COLLECT, Config, ConfigError, impossible
+from taic_jax.envs import environment_options, make_env
+from taic_jax.envs.base import Env
+from taic_jax.envs.errors import UnknownNameError
+from taic_jax.options.model import OptionModel
+from taic_jax.summary import replay_sizes
+
+
+def make_envs(config: Config) -> tuple[Env, Env]:
+    """Return the task and the environment of stage collect.
+
+    Raises:
+      ConfigError: there is no such environment, or options learnt in one do not fit the other.
+    """
+    options = dataclasses.asdict(config.env)
+    field, name = "env.name", options.pop("name")
+    try:
+        env = source = make_env(name, **options)
+        if config.collect.env:
+            field, name = "collect.env", config.collect.env
+            shared = ("backend", "num_threads", *environment_options(name))
+            source = make_env(name, **{option: options[option] for option in shared})
+    except UnknownNameError as error:
+        raise ConfigError(f"{field}: {error}") from None
+    bodies = [(*describe(e).values(),)[1:] for e in (source, env)]
+    if bodies[0] != bodies[1]:
+        expected = f"the body of {config.env.name} (proprioceptive slice, its size, and action size {bodies[1]})"
+        raise impossible("collect.env", f"{config.collect.env} with {bodies[0]}", expected)
+    if config.train.ppo.reset_at_change and "changed" not in jax.eval_shape(env.reset, jax.random.key(0)).metrics:
+        expected = "a task that changes, as nav2d does with env.change_after"
+        raise impossible("train.ppo.reset_at_change", f"{config.env.name}, which never does", expected, False)
+    if config.options.views == "all" and len(source.views) == 1 and not config.options.source:
+        expected = "a body with several equal sides, as ant has"
+        raise impossible("options.views", f"all with {source.name}, which has one", expected, "one")
+    if config.options.length > (longest := env.episode_length):
+        expected = f"at most the {longest} ticks of an episode of {env.name}"
+        raise impossible("options.length", config.options.length, expected, longest)
+    for name, group, task in (("collect", config.collect, source), ("train", config.train, env)):
+        if group.learner == "sac" and group.sac.relabel and task.goals is None:
+            expected = "a task with goals in its observations, as nav2d_random and the arenas have"
+            raise impossible(f"{name}.sac.relabel", f"{group.sac.relabel} on {task.name}, which has none", expected, 0)
+    return env, source
+
+
+def check_memory(config: Config, env: Env, source: Env) -> None:
+    """Raise ConfigError if a replay buffer alone is larger than the memory of the machine."""
+    total = psutil.virtual_memory().total
+    for name, size in replay_sizes(config, env, source).items():
+        group = config.collect if name == COLLECT else config.train
+        if size > total:
+            fits = int(min(group.sac.capacity, group.ticks) * total / size / 2)
+            expected = f"a buffer within the memory, {total / 2**30:.0f} GiB, for {config.seeds} seeds"
+            raise impossible(f"{name}.sac.capacity", group.sac.capacity, expected, fits)
+
+
+class Inherited(NamedTuple):
+    """The option models, the collector's policies and those over options [K] of another run, each None if not taken."""
+
+    model: OptionModel | None = None
+    flat: Weights | None = None
+    policy: Weights | None = None
+
+
+def take_over(config: Config, env: Env, source: Env) -> Inherited:
+    """Return all that the config takes from another run; seed k takes the k-th, modulo their number.
+
+    Experience is only checked, by reading that of one seed.
+
+    Raises:
+      ArtifactError: the source is missing, or has another body or another structure.
+    """
+    if not config.options.source:
+        for name in config.options.experience:
+            if name != COLLECT:
+                gather_experience(Path(name), source, 1)
+        return Inherited()
+    name, flat, policy = config.options.source, None, None
+    if config.train.init:
+        model, policy = load_taic(name, env, config)
+    else:
+        model = load_options(name, env, config.options, config.seeds)
+    if "transfer" in config.train.baselines:
+        flat = load_policy(name, env, config.collect.ppo, config.seeds)
+    return Inherited(model, flat, policy)
