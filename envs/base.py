@@ -77,6 +77,7 @@ class Env(abc.ABC):
     proprioception: str  # name of that slice; without it no other task shares the slice
     episode_length: int  # ticks
     dt: float  # seconds a tick
+    discrete: bool = False  # whether an action is one-hot, one of A
 
     @property
     def views(self) -> Views:

@@ -30,6 +30,11 @@ class Wrapper(Env):
         return self.env.views
 
     @property
+    def discrete(self) -> bool:
+        """Whether the inner environment's actions are one-hot."""
+        return self.env.discrete
+
+    @property
     def goals(self) -> Goals | None:
         """Goals of the inner environment."""
         return self.env.goals

@@ -85,9 +85,44 @@ class Policy(struct.PyTreeNode):
         option = distribution.loc + exploration * distribution.scale_diag * noise
         return option, distribution.log_prob(option)
 
+    def divergence(self, distribution: Any) -> Float[Array, "*batch"]:
+        """Return KL(pi(o|s) || N(0, I)) in nats."""
+        mean = distribution.loc
+        return distribution.kl_divergence(distrax.MultivariateNormalDiag(jnp.zeros_like(mean), jnp.ones_like(mean)))
+
     def value(self, params: PolicyParams, obs: Float[Array, "*batch S"]) -> Float[Array, "*batch"]:
         """Return V(s) for normalised observations."""
         return apply(self._critic, params.critic, obs)[..., 0]
+
+
+class CategoricalPolicy(Policy):
+    """pi(o|s) and V(s) for D discrete options, each one-hot; `log_std` is not used."""
+
+    def distribution(self, params: PolicyParams, obs: Float[Array, "*batch S"]) -> distrax.OneHotCategorical:
+        """Return pi(o|s) for normalised observations."""
+        return distrax.OneHotCategorical(apply(self._actor, params.actor, obs), dtype=jnp.float32)
+
+    def draw(
+        self, params: PolicyParams, obs: Float[Array, "*batch S"], exploration: Scalar, noise: Float[Array, "*batch D"]
+    ) -> tuple[Float[Array, "*batch D"], Float[Array, "*batch"]]:
+        """Do as `Policy.draw`; exploration 0 takes the most probable option."""
+        distribution: Any = self.distribution(params, obs)
+        option = one_hot_of(distribution.logits + exploration * gumbel(noise))
+        return option, distribution.log_prob(option)
+
+    def divergence(self, distribution: Any) -> Float[Array, "*batch"]:
+        """Return the KL divergence from uniform options in nats."""
+        return jnp.log(float(self.option_size)) - distribution.entropy()
+
+
+def gumbel(noise: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Return standard Gumbel numbers of standard normal ones, whose order they keep."""
+    return -jnp.log(-jax.scipy.special.log_ndtr(noise))
+
+
+def one_hot_of(scores: Float[Array, "*batch D"]) -> Float[Array, "*batch D"]:
+    """Return 1 at the greatest score and 0 elsewhere."""
+    return jax.nn.one_hot(jnp.argmax(scores, axis=-1), scores.shape[-1])
 
 
 class SquashedParams(struct.PyTreeNode):
@@ -126,6 +161,52 @@ class SquashedPolicy(struct.PyTreeNode):
         squashed, log_det = distrax.Block(distrax.Tanh(), 1).forward_and_log_det(before)
         log_prob: Any = normal.log_prob(before)
         return params.bound * squashed, log_prob - log_det
+
+    def uniform(self, params: SquashedParams, noise: Float[Array, "*batch D"]) -> Float[Array, "*batch D"]:
+        """Return uniformly random options within the bound, by standard normal noise."""
+        return params.bound * (2.0 * jax.scipy.stats.norm.cdf(noise) - 1.0)
+
+
+class GreedyParams(struct.PyTreeNode):
+    """Parameters of the values Q(s, .), and the share of random options."""
+
+    values: Any
+    epsilon: Array
+
+
+class GreedyPolicy(struct.PyTreeNode):
+    """The best of D discrete options by their values, each one-hot; or, with probability epsilon, a random one."""
+
+    option_size: int = struct.field(pytree_node=False)
+    hidden_sizes: tuple[int, ...] = struct.field(pytree_node=False)
+    layer_norm: bool = struct.field(pytree_node=False)
+
+    @property
+    def _values(self) -> MLP:
+        return MLP((*self.hidden_sizes, self.option_size), activation=nn.relu, layer_norm=self.layer_norm)
+
+    def init(self, key: Key[Array, ""], observation_size: int, epsilon: Scalar) -> GreedyParams:
+        """Return fresh parameters."""
+        return GreedyParams(self._values.init(key, jnp.zeros(observation_size)), jnp.asarray(epsilon, jnp.float32))
+
+    def evaluate(self, values: Any, obs: Float[Array, "*batch S"]) -> Float[Array, "*batch D"]:
+        """Return Q(s, o) of every option for normalised observations."""
+        return apply(self._values, values, obs)
+
+    def draw(
+        self, params: GreedyParams, obs: Float[Array, "*batch S"], exploration: Scalar, noise: Float[Array, "*batch D"]
+    ) -> tuple[Float[Array, "*batch D"], Float[Array, "*batch"]]:
+        """Return an option by standard normal noise, and its log-probability; `exploration` scales epsilon."""
+        best, epsilon = one_hot_of(self.evaluate(params.values, obs)), exploration * params.epsilon
+        # The greatest of the numbers is independent of its place, and its power by its distribution is uniform.
+        chance = jax.scipy.stats.norm.cdf(jnp.max(noise, axis=-1)) ** self.option_size
+        option = jnp.where((chance < epsilon)[..., None], self.uniform(params, noise), best)
+        share = jnp.sum(option * best, axis=-1) * (1.0 - epsilon) + epsilon / self.option_size
+        return option, jnp.log(share)
+
+    def uniform(self, params: GreedyParams, noise: Float[Array, "*batch D"]) -> Float[Array, "*batch D"]:
+        """Return uniformly random options by standard normal noise."""
+        return one_hot_of(noise)
 
 
 class Critics(struct.PyTreeNode):

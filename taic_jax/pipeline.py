@@ -13,7 +13,7 @@ from taic_jax import trainer
 from taic_jax.artifacts.agents import Weights, save_agents
 from taic_jax.artifacts.experience import EXPERIENCE, ExperienceStore, gather_experience, num_blocks
 from taic_jax.artifacts.models import AGENTS, OPTIONS, describe, save_options
-from taic_jax.config import COLLECT, TAIC, Config, ConfigError, Shard, collector_is_baseline, needs_collect
+from taic_jax.config import COLLECT, TAIC, Config, ConfigError, Shard, collector_is_baseline, impossible, needs_collect
 from taic_jax.envs.base import Env
 from taic_jax.envs.errors import RenderingError
 from taic_jax.nonfinite import without_stopped
@@ -175,6 +175,9 @@ def learn(run: Run, env: Env) -> OptionModel:
         step, unit = trainer.learn_rows, trainer.steps_per_log(config)
         state = drive(run, "learn", step, state, config, dataset, num_steps=config.steps // unit, unit=unit)
     model = learning.as_model(state, dataset)
+    if config.codes:
+        book = _compile_rows(run, "learn", trainer.books_of_rows, config, state, dataset)(config, state, dataset)
+        model = model.replace(book=book)
     save_options(run.folder.path / OPTIONS, model, env, config)
     return model
 
@@ -197,6 +200,8 @@ def select_windows(run: Run, env: Env) -> Dataset:
     select = jax.vmap(partial(make_dataset, views=env.views))
     dataset = _compile_rows(run, "learn", select, sources, config)(sources, config)
     span = f"in {', '.join(names)} between its shares {jnp.min(config.since):g} and {jnp.max(config.until):g}"
+    if config.codes and (fewest := int(dataset.count.min())) < config.codes:
+        raise impossible("options.codes", config.codes, f"at most the {fewest} windows {span}", fewest)
     if not dataset.count.all():
         raise ConfigError(
             "options.length: expected the experience to hold windows of so many ticks, "

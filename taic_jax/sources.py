@@ -10,7 +10,7 @@ import psutil
 from taic_jax.artifacts.agents import Weights, load_policy, load_taic
 from taic_jax.artifacts.experience import gather_experience
 from taic_jax.artifacts.models import describe, load_options
-from taic_jax.config import COLLECT, Config, ConfigError, impossible
+from taic_jax.config import COLLECT, Config, ConfigError, ReplayConfig, impossible, settings_of
 from taic_jax.envs import environment_options, make_env
 from taic_jax.envs.base import Env
 from taic_jax.envs.errors import UnknownNameError
@@ -48,21 +48,36 @@ def make_envs(config: Config) -> tuple[Env, Env]:
         expected = f"at most the {longest} ticks of an episode of {env.name}"
         raise impossible("options.length", config.options.length, expected, longest)
     for name, group, task in (("collect", config.collect, source), ("train", config.train, env)):
-        if group.learner == "sac" and group.sac.relabel and task.goals is None:
+        learner = settings_of(group)
+        if isinstance(learner, ReplayConfig) and learner.relabel and task.goals is None:
             expected = "a task with goals in its observations, as nav2d_random and the arenas have"
-            raise impossible(f"{name}.sac.relabel", f"{group.sac.relabel} on {task.name}, which has none", expected, 0)
+            got = f"{learner.relabel} on {task.name}, which has none"
+            raise impossible(f"{name}.{group.learner}.relabel", got, expected, 0)
+    _check_actions(config, env, source)
     return env, source
+
+
+def _check_actions(config: Config, env: Env, source: Env) -> None:
+    """Raise ConfigError for what does not fit the kind of actions: a flat learner, or noise on D's actions."""
+    if config.collect.learner == ("sac" if source.discrete else "dqn"):
+        kind, nearest = ("discrete", "dqn") if source.discrete else ("continuous", "sac")
+        expected = f"ppo or {nearest} for {kind} actions, as of {source.name}"
+        raise impossible("collect.learner", config.collect.learner, expected, nearest)
+    if config.train.fine_tune.epochs and env.discrete:
+        expected = f"none for discrete actions, as of {env.name}"
+        raise impossible("train.fine_tune.epochs", config.train.fine_tune.epochs, expected, 0)
 
 
 def check_memory(config: Config, env: Env, source: Env) -> None:
     """Raise ConfigError if a replay buffer alone is larger than the memory of the machine."""
     total = psutil.virtual_memory().total
     for name, size in replay_sizes(config, env, source).items():
-        group = config.collect if name == COLLECT else config.train
         if size > total:
-            fits = int(min(group.sac.capacity, group.ticks) * total / size / 2)
+            group = config.collect if name == COLLECT else config.train
+            capacity = (group.sac if group.learner == "sac" else group.dqn).capacity
+            fits = int(min(capacity, group.ticks) * total / size / 2)
             expected = f"a buffer within the memory, {total / 2**30:.0f} GiB, for {config.seeds} seeds"
-            raise impossible(f"{name}.sac.capacity", group.sac.capacity, expected, fits)
+            raise impossible(f"{name}.{group.learner}.capacity", capacity, expected, fits)
 
 
 class Inherited(NamedTuple):

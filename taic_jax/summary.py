@@ -16,6 +16,7 @@ from taic_jax.artifacts.experience import experience_bytes
 from taic_jax.config import (
     COLLECT,
     Config,
+    ReplayConfig,
     collector_is_baseline,
     experience_ticks,
     method_label,
@@ -27,8 +28,8 @@ from taic_jax.envs.rendering import write_webp
 from taic_jax.nonfinite import FINITE, QUANTITIES
 from taic_jax.rl.agent import Agent
 from taic_jax.rl.learner import num_iterations
+from taic_jax.rl.off_policy import goals_of
 from taic_jax.rl.replay import row_size
-from taic_jax.rl.sac import goals_of
 from taic_jax.runtime.checkpoint import version_of
 from taic_jax.runtime.driver import Run, Stopped
 from taic_jax.runtime.files import atomic_file, json_safe, writes_here
@@ -67,18 +68,19 @@ def plan(config: Config, env: Env, source: Env) -> str:
 
 
 def replay_sizes(config: Config, env: Env, source: Env) -> dict[str, int]:
-    """Return the bytes of SAC's replay buffers of all seeds, by the stage that has one."""
+    """Return the bytes of the replay buffers of all seeds, by the stage that has one."""
     options = config.options
     stages = (
         ("collect", config.collect, source, env.action_size, 1),
-        ("train", config.train, env, options.size, options.length),
+        ("train", config.train, env, options.codes or options.size, options.length),
     )
     sizes = {}
     for name, group, task, option_size, length in stages:
-        if group.learner == "sac":
-            goals = goals_of(group.sac, task)
+        learner = settings_of(group)
+        if isinstance(learner, ReplayConfig):
+            goals = goals_of(learner, task)
             row = row_size(task.observation_size, option_size, length, goals.size if goals else 0)
-            sizes[name] = 4 * row * min(group.sac.capacity, group.ticks) * config.seeds
+            sizes[name] = 4 * row * min(learner.capacity, group.ticks) * config.seeds
     return sizes
 
 

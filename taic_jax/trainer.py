@@ -11,7 +11,7 @@ from jaxtyping import Array
 
 from taic_jax.analysis.evaluate import evaluate
 from taic_jax.artifacts.experience import as_experience
-from taic_jax.config import COLLECT, Config, OptionsConfig, SACConfig, replace, settings_of
+from taic_jax.config import COLLECT, Config, OptionsConfig, ReplayConfig, replace, settings_of
 from taic_jax.envs.base import Env
 from taic_jax.networks import PolicyParams
 from taic_jax.options import learning
@@ -44,14 +44,14 @@ class Trainer:
 
     def _within(self, settings: Settings) -> Settings:
         """Keep no more decisions than there are ticks."""
-        if isinstance(settings, SACConfig):
+        if isinstance(settings, ReplayConfig):
             return replace(settings, "capacity", min(settings.capacity, self.ticks))
         return settings
 
     @property
     def executor(self) -> Executor:
         """The executor of the policy's options."""
-        return IdentityExecutor(self.env.action_size, self.hold)
+        return IdentityExecutor(self.env.action_size, self.hold, self.env.discrete)
 
     @property
     def unit(self) -> int:
@@ -167,7 +167,7 @@ def agents_of_rows(make: Callable[..., Trainer], rows: Row, states: Any) -> Agen
 
 def init_learning(env: Env, config: OptionsConfig, keys: Array) -> LearnState:
     """Return the states [K] before the first gradient step, for configs [K]."""
-    networks = make_networks(config, env.proprioceptive_size, env.action_size)
+    networks = make_networks(config, env.proprioceptive_size, env.action_size, env.discrete)
     return jax.vmap(lambda config, key: learning.init(config, networks, key))(config, keys)
 
 
@@ -175,6 +175,11 @@ def learn_rows(states: LearnState, config: OptionsConfig, dataset: Dataset) -> t
     """Take the gradient steps between two log lines, of every row."""
     unit = steps_per_log(config)
     return jax.vmap(lambda state, config, data: learning.steps(config, unit, state, data))(states, config, dataset)
+
+
+def books_of_rows(config: OptionsConfig, states: LearnState, dataset: Dataset) -> Array:
+    """Return the code books [K, M, D] of learnt models."""
+    return jax.vmap(learning.code_book)(config, states, dataset)
 
 
 def steps_per_log(config: OptionsConfig) -> int:

@@ -135,6 +135,7 @@ class Repeat(struct.PyTreeNode):
     length: int = struct.field(pytree_node=False)
     option_size: int = struct.field(pytree_node=False, default=1)
     noise_size: int = struct.field(pytree_node=False, default=0)
+    discrete: bool = struct.field(pytree_node=False, default=False)
 
     def start(self, option: Array, obs: Array) -> Array:
         """Carry the action."""

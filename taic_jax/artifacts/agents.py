@@ -87,7 +87,7 @@ def _empty_agent(description: Description) -> Agent:
         settings = settings_of(config.train)
     else:
         hold = config.options.length if description.method == "repeat" else 1
-        executor, settings = IdentityExecutor(body.action_size, hold), settings_of(config.collect)
+        executor, settings = IdentityExecutor(body.action_size, hold, body.discrete), settings_of(config.collect)
     size = description.observation_size
     policy = learner_of(settings).make_policy(executor, settings)
     return Agent(executor, policy.init(jax.random.key(0), size, 1.0), normalize.init((size,)), policy)

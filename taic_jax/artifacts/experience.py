@@ -43,7 +43,7 @@ def collect(config: CollectConfig, env: Env, key: Key[Array, ""]) -> tuple[Agent
     Return the agent, the metrics of every iteration, and the newest experience [T, B, ...], within the capacity.
     """
     config = as_arrays(config)
-    executor = IdentityExecutor(env.action_size)
+    executor = IdentityExecutor(env.action_size, discrete=env.discrete)
     settings = settings_of(config)
     learner, count = learner_of(settings), num_iterations(settings, config.ticks)
     late = min(num_blocks(config), count)

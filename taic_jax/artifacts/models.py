@@ -26,7 +26,11 @@ FORMAT = 1  # of the two files; a later one is refused
 MODEL = "executor.model."  # begins the names of an option model's arrays among those of agents
 
 # The fields in which a frozen option model must agree with the config that uses it: its shapes and their meaning.
-STRUCTURE = ("decoder", "size", "length", "termination", "hidden_size", "mlp_sizes", "decoder_sizes")
+STRUCTURE = ("decoder", "size", "length", "termination", "hidden_size", "mlp_sizes", "decoder_sizes", "codes")
+
+
+# What the first descriptions do not say, there being nothing else.
+EARLIER = {"learner": "ppo", "discrete": False, "options.codes": 0}
 
 
 class Body(NamedTuple):
@@ -36,11 +40,12 @@ class Body(NamedTuple):
     proprioception: str
     proprioceptive_size: int
     action_size: int
+    discrete: bool
 
 
 def read_body(folder: Path) -> Body:
     """Return the body in an artifact's description, or raise ArtifactError without one."""
-    description = read_description(folder) or {}
+    description = EARLIER | (read_description(folder) or {})
     try:
         return Body(description["env"], *(description[name] for name in Body._fields[1:]))
     except KeyError:
@@ -54,6 +59,7 @@ def describe(env: Env | Body) -> dict[str, Any]:
         "proprioception": getattr(env, "proprioception", env.name),
         "proprioceptive_size": env.proprioceptive_size,
         "action_size": env.action_size,
+        "discrete": env.discrete,
     }
 
 
@@ -79,7 +85,7 @@ def described(folder: Path, kind: str) -> dict[str, Any]:
     if (version := description.get("format", FORMAT)) > FORMAT:
         writer = f"taic_jax {description.get('taic_jax')} wrote format {version}"
         raise ArtifactError(f"{folder}: {writer}, this is taic_jax {__version__}, which reads formats to {FORMAT}")
-    return {"learner": "ppo"} | description  # the first agents had no other
+    return EARLIER | description
 
 
 def save_artifact(folder: Path, tree: Any, description: dict[str, Any]) -> None:
@@ -141,9 +147,10 @@ def for_seeds(seeds: int, rows: Tree) -> Tree:
 
 def empty_model(env: Env | Body, config: OptionsConfig) -> OptionModel:
     """Return an option model of this structure, whose numbers are not meaningful."""
-    networks = make_networks(config, env.proprioceptive_size, env.action_size)
+    networks = make_networks(config, env.proprioceptive_size, env.action_size, env.discrete)
     params, zeros = init_params(networks, config, jax.random.key(0)), jnp.zeros(env.proprioceptive_size)
-    return OptionModel(params, Scale(zeros, zeros), Scale(zeros, zeros), jnp.zeros(()), networks)
+    book = jnp.zeros((config.codes, config.size)) if config.codes else None
+    return OptionModel(params, Scale(zeros, zeros), Scale(zeros, zeros), jnp.zeros(()), networks, book)
 
 
 def rows_like(count: int, make: Callable[[], Any]) -> Any:

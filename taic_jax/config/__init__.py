@@ -22,13 +22,14 @@ from taic_jax.config.base import (
     Track,
     impossible,
 )
-from taic_jax.config.learners import FineTuneConfig, PPOConfig, SACConfig
+from taic_jax.config.learners import DQNConfig, FineTuneConfig, PPOConfig, ReplayConfig, SACConfig
 
 __all__ = [
     "COLLECT", "CONFIG_CLASSES", "METHOD_LABELS", "TAIC", "TINY", "USUAL_BOUNDS", "Bounds", "CollectConfig", "Config",
-    "ConfigError", "EnvConfig", "EvaluateConfig", "FineTuneConfig", "Learner", "Natural", "OptionsConfig", "PPOConfig",
-    "Positive", "SACConfig", "Shard", "Share", "Track", "TrainConfig", "collector_is_baseline", "experience_ticks",
-    "field_types", "impossible", "method_label", "needs_collect", "replace", "settings_of", "walk",
+    "ConfigError", "DQNConfig", "EnvConfig", "EvaluateConfig", "FineTuneConfig", "Learner", "Natural", "OptionsConfig",
+    "PPOConfig", "Positive", "ReplayConfig", "SACConfig", "Shard", "Share", "Track", "TrainConfig",
+    "collector_is_baseline", "experience_ticks", "field_types", "impossible", "method_label", "needs_collect",
+    "replace", "settings_of", "walk",
 ]  # fmt: skip
 
 
@@ -66,9 +67,10 @@ class CollectConfig:
     capacity: Natural = 0
     """Newest ticks of experience to keep, per seed; 0 keeps all."""
     learner: Learner = "ppo"
-    """Learner of the flat policies, those of the baselines too: ppo or sac."""
+    """Learner of the flat policies, those of the baselines too: ppo or sac; with discrete actions ppo or dqn."""
     ppo: PPOConfig = PPOConfig()
     sac: SACConfig = SACConfig()
+    dqn: DQNConfig = DQNConfig()
 
 
 @dataclass(frozen=True)
@@ -134,6 +136,11 @@ class OptionsConfig:
     state_noise: float = 0.0
     """Standard deviation of noise on the state that a closed-loop D learns from, so that it depends on the code; the
     unit is each entry's own standard deviation."""
+    codes: Natural = 0
+    """Options of a code book, the centres of the codes of windows, for a policy over discrete options; 0 for codes
+    of any value."""
+    sample_actions: bool = False
+    """Draw discrete actions by the probabilities that D gives them; otherwise take the most probable."""
 
 
 @dataclass(frozen=True)
@@ -148,9 +155,10 @@ class TrainConfig:
     init: str = ""
     """Run whose policy over options is trained further, with its options (--init for short); empty for a new policy."""
     learner: Learner = "ppo"
-    """Learner of the policy over options: ppo or sac."""
+    """Learner of the policy over options: ppo or sac; with options.codes ppo or dqn."""
     ppo: PPOConfig = PPOConfig(log_std_init=0.0)
     sac: SACConfig = SACConfig()
+    dqn: DQNConfig = DQNConfig()
     fine_tune: FineTuneConfig = FineTuneConfig()
 
 
@@ -180,7 +188,8 @@ class Config:
 
 
 CONFIG_CLASSES = (
-    EnvConfig, PPOConfig, SACConfig, CollectConfig, OptionsConfig, FineTuneConfig, TrainConfig, EvaluateConfig, Config,
+    EnvConfig, PPOConfig, ReplayConfig, SACConfig, DQNConfig, CollectConfig, OptionsConfig, FineTuneConfig, TrainConfig,
+    EvaluateConfig, Config,
 )  # fmt: skip
 
 COLLECT = "collect"
@@ -202,9 +211,9 @@ def method_label(method: str, learner: str) -> str:
     return METHOD_LABELS.get(method, method).replace("PPO", learner.upper())
 
 
-def settings_of(group: CollectConfig | TrainConfig) -> PPOConfig | SACConfig:
+def settings_of(group: CollectConfig | TrainConfig) -> PPOConfig | SACConfig | DQNConfig:
     """Return the settings of the group's learner."""
-    return group.sac if group.learner == "sac" else group.ppo
+    return {"ppo": group.ppo, "sac": group.sac, "dqn": group.dqn}[group.learner]
 
 
 def experience_ticks(config: CollectConfig) -> int:

@@ -6,6 +6,8 @@ from typing import Annotated, Any, get_args, get_origin
 
 from taic_jax.config import USUAL_BOUNDS, Config, field_types, impossible, walk
 
+REPLAYS = ("collect.sac", "collect.dqn", "train.sac", "train.dqn")
+
 
 def validate(config: Config) -> None:
     """Raise `ConfigError` at the first impossible value, naming field, value, expectation and nearest."""
@@ -34,8 +36,13 @@ def validate(config: Config) -> None:
 
 
 def _check_learners(config: Config) -> None:
-    """Check that each learner does all that is asked of it, and that SAC's rounds divide its iteration."""
-    train, flat = config.train, config.collect.learner
+    """Check that each learner does all that is asked of it, and that the rounds of replay divide an iteration."""
+    train, flat, codes = config.train, config.collect.learner, config.options.codes
+    if train.learner == ("sac" if codes else "dqn"):
+        kind = f"with options.codes = {codes} ppo or dqn" if codes else "with options.codes = 0 ppo or sac"
+        raise impossible("train.learner", train.learner, kind, "dqn" if codes else "sac")
+    if codes == 1:
+        raise impossible("options.codes", 1, "0 or at least 2", 2)
     for applies, name, learner, needed in (
         (train.fine_tune.epochs, "train.learner", train.learner, "ppo with train.fine_tune.epochs"),
         (train.init, "train.learner", train.learner, "ppo with train.init"),
@@ -43,14 +50,16 @@ def _check_learners(config: Config) -> None:
     ):
         if applies and learner != "ppo":
             raise impossible(name, learner, needed, "ppo")
-    for name, sac in (("collect", config.collect.sac), ("train", train.sac)):
-        if sac.capacity < sac.num_envs:
-            expected = f"a transition for each of {name}.sac.num_envs = {sac.num_envs}"
-            raise impossible(f"{name}.sac.capacity", sac.capacity, expected, sac.num_envs)
-        if sac.rollout_length % sac.update_every:
-            valid = max(n for n in range(1, sac.update_every + 1) if sac.rollout_length % n == 0)
-            expected = f"a divisor of {name}.sac.rollout_length = {sac.rollout_length}"
-            raise impossible(f"{name}.sac.update_every", sac.update_every, expected, valid)
+    for stage, group in (("collect", config.collect), ("train", train)):
+        for name, learner in ((f"{stage}.sac", group.sac), (f"{stage}.dqn", group.dqn)):
+            if learner.capacity < learner.num_envs:
+                expected = f"a transition for each of {name}.num_envs = {learner.num_envs}"
+                raise impossible(f"{name}.capacity", learner.capacity, expected, learner.num_envs)
+            if learner.rollout_length % learner.update_every:
+                rounds = range(1, learner.update_every + 1)
+                valid = max(n for n in rounds if learner.rollout_length % n == 0)
+                expected = f"a divisor of {name}.rollout_length = {learner.rollout_length}"
+                raise impossible(f"{name}.update_every", learner.update_every, expected, valid)
 
 
 def _check_bounds(name: str, kind: Any, value: Any) -> None:
@@ -74,7 +83,7 @@ def _check_limits(config: Config) -> None:
         (flat == "collect.ppo", "collect.ppo.minibatch_size", le, "at most", collected),
         (True, "collect.ticks", ge, "at least one iteration,", collected),
         (by_ppo, "train.ppo.minibatch_size", le, "at most", trained),
-        *((True, f"{x}.sac.update_every", le, "at most", f"{x}.sac.rollout_length") for x in ("collect", "train")),
+        *((True, f"{x}.update_every", le, "at most", f"{x}.rollout_length") for x in REPLAYS),
         (config.train.fine_tune.epochs, "train.fine_tune.minibatch_size", le, "at most", trained),
         (True, "train.ticks", ge, "at least one iteration,", trained),
         (by_ppo, "options.length", le, "at most", "train.ppo.rollout_length"),

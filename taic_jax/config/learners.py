@@ -35,6 +35,8 @@ class PPOConfig:
     """Weight of the critic's loss."""
     entropy_weight: float = 0.0
     """Weight of the entropy bonus."""
+    prior_weight: float = 0.0
+    """Weight of the KL divergence of the policy from N(0, I), or of discrete options from the uniform one."""
     max_grad_norm: Positive = 0.5
     """Global norm at which gradients are clipped."""
     log_std_init: LogStd = -0.916
@@ -50,8 +52,8 @@ class PPOConfig:
 
 
 @dataclass(frozen=True)
-class SACConfig:
-    """Soft actor-critic over decisions, with a replay buffer of them and semi-Markov targets."""
+class ReplayConfig:
+    """Learning from a replay buffer of decisions, with semi-Markov targets."""
 
     num_envs: int = 16
     """Environments that run side by side."""
@@ -76,18 +78,36 @@ class SACConfig:
     the episode (hindsight)."""
     horizon: int = 50
     """Most decisions between a transition and the later one whose achievement becomes its goal."""
-    bound: Positive = 3.0
-    """Greatest entry of an option code; an action's is 1."""
     learning_rate: float = 3e-4
-    """Step size of Adam for actor, critics and temperature."""
+    """Step size of Adam."""
     gamma: Share = 0.99
     """Discount per tick."""
     tau: Share = 0.005
     """Share of the critics that their targets take over at each gradient step."""
+
+
+@dataclass(frozen=True)
+class SACConfig(ReplayConfig):
+    """Soft actor-critic over decisions, with twin critics."""
+
+    bound: Positive = 3.0
+    """Greatest entry of an option code; an action's is 1."""
     temperature: Positive = 1.0
     """Initial temperature, the weight of the entropy, which is learnt."""
     target_entropy: Annotated[float, Bounds(-math.inf)] = -1.0
     """Entropy of the policy that the temperature is learnt for, per dimension, of options in units of their bound."""
+    prior_weight: float = 0.0
+    """Weight of the KL divergence of the policy from N(0, I), in place of temperature and entropy; 0 for these."""
+
+
+@dataclass(frozen=True)
+class DQNConfig(ReplayConfig):
+    """Double DQN over decisions of discrete options or actions."""
+
+    epsilon: Share = 0.05
+    """Share of random options at the end of the fall."""
+    epsilon_steps: Positive = 10_000.0
+    """Gradient steps over which the share of random options falls from 1."""
 
 
 @dataclass(frozen=True)

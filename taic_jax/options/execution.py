@@ -7,7 +7,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float
 
 from taic_jax.config import OptionsConfig
-from taic_jax.networks import apply
+from taic_jax.networks import apply, gumbel, one_hot_of
 from taic_jax.options.model import OptionModel
 from taic_jax.options.termination import Termination, make_termination
 from taic_jax.types import Scalar
@@ -25,6 +25,11 @@ class Executor(Protocol):
     @property
     def length(self) -> int:
         """L, the most ticks of an option."""
+        ...
+
+    @property
+    def discrete(self) -> bool:
+        """Whether options are one-hot."""
         ...
 
     @property
@@ -46,10 +51,11 @@ class Executor(Protocol):
 
 
 class IdentityExecutor(struct.PyTreeNode):
-    """Flat control: the option is the action, held for `length` ticks, by default one."""
+    """Flat control: the option is the action, held for `length` ticks, by default one; one-hot if `discrete`."""
 
     option_size: int = struct.field(pytree_node=False)
     length: int = struct.field(pytree_node=False, default=1)
+    discrete: bool = struct.field(pytree_node=False, default=False)
     noise_size: int = struct.field(pytree_node=False, default=0)
 
     def start(self, option: Float[Array, " A"], obs: Float[Array, " S"]) -> Float[Array, " A"]:
@@ -74,40 +80,60 @@ class Decoding(struct.PyTreeNode):
 
 
 class OptionExecutor(struct.PyTreeNode):
-    """D under a termination rule; with `std`, actions are drawn from a normal distribution around D's output."""
+    """D under a termination rule; with `std`, actions are drawn from a normal distribution around D's output.
+
+    Discrete actions have D's greatest logit, after Gumbel noise times `std`: 1 draws them by their probabilities. With
+    `codes` an option is one-hot, one of the model's code book.
+    """
 
     model: OptionModel
     termination: Termination = struct.field(pytree_node=False)
     length: int = struct.field(pytree_node=False)
     std: Scalar = struct.field(default=None)
+    codes: int = struct.field(pytree_node=False, default=0)
 
     @property
     def option_size(self) -> int:
-        """D."""
-        return self.model.networks.encoder.option_size
+        """D, or the codes of the book."""
+        return self.codes or self.model.networks.encoder.option_size
+
+    @property
+    def discrete(self) -> bool:
+        """Whether options are one-hot: those of a code book."""
+        return self.codes > 0
 
     @property
     def noise_size(self) -> int:
         """X, the standard normal numbers of a tick: those of the termination rule, then any one per action."""
         return self.termination.noise_size + (0 if self.std is None else self.model.networks.decoder.action_size)
 
-    def start(self, option: Float[Array, " D"], obs: Float[Array, " S"]) -> Decoding:
+    def code(self, option: Float[Array, "*batch M"]) -> Float[Array, "*batch D"]:
+        """Return the codes of options."""
+        return option @ self.model.book if self.codes else option
+
+    def start(self, option: Float[Array, " M"], obs: Float[Array, " S"]) -> Decoding:
         """Set D's carry from the code."""
-        carry = self._decoder(option, method="start")
-        return Decoding(option, carry, self.termination.start(self.model, self._state(obs)))
+        code = self.code(option)
+        carry = self._decoder(code, method="start")
+        return Decoding(code, carry, self.termination.start(self.model, self._state(obs)))
 
     def act(self, carry: Decoding, obs: Float[Array, " S"], noise: Float[Array, " X"]) -> tuple[Decoding, Array]:
-        """Emit D's next action, with any noise, clipped to its bounds."""
+        """Emit D's next action, with any noise, clipped to its bounds or one-hot."""
         state = self.model.state_scale(self._state(obs))
-        next_carry, (action, end_logit) = self._decoder(carry.carry, carry.option, state, method="step")
-        disturbance = 0.0 if self.std is None else self.std * noise[self.termination.noise_size :]
-        action = jnp.clip(action + disturbance, -1.0, 1.0)
+        next_carry, (output, end_logit) = self._decoder(carry.carry, carry.option, state, method="step")
+        action = self._action(output, noise[self.termination.noise_size :])
         followed = self.termination.follow(self.model, carry.memory, action, end_logit)
         return Decoding(carry.option, next_carry, followed), action
 
     def ended(self, carry: Decoding, obs: Float[Array, " S"], noise: Float[Array, " X"]) -> Bool[Array, ""]:
         """Ask the termination rule."""
         return self.termination.ended(self.model, carry.memory, self._state(obs), noise[: self.termination.noise_size])
+
+    def _action(self, output: Float[Array, " A"], noise: Array) -> Float[Array, " A"]:
+        discrete = self.model.networks.discrete
+        if self.std is not None:
+            output = output + self.std * (gumbel(noise) if discrete else noise)
+        return one_hot_of(output) if discrete else jnp.clip(output, -1.0, 1.0)
 
     def _state(self, obs: Float[Array, " S"]) -> Float[Array, " P"]:
         """Return the proprioceptive slice: an observation may have more entries than the model reads."""
@@ -124,4 +150,5 @@ def make_executor(config: OptionsConfig, model: OptionModel) -> OptionExecutor:
     """
     if config.delta_unit == "error":
         model = model.replace(delta=jnp.asarray(config.delta, jnp.float32))
-    return OptionExecutor(model, make_termination(config), config.length)
+    executor = OptionExecutor(model, make_termination(config), config.length, codes=config.codes)
+    return executor.replace(std=jnp.ones(())) if config.sample_actions and model.networks.discrete else executor

@@ -1,5 +1,6 @@
 """Option learning from windows: E, D, P and F jointly (§3.2-3.4, Algorithm 1)."""
 
+import dataclasses
 from collections.abc import Sequence
 from functools import partial
 from typing import Any
@@ -13,6 +14,7 @@ from jaxtyping import Array, Float, Int, Key
 from taic_jax.config import OptionsConfig
 from taic_jax.envs.views import Views
 from taic_jax.nonfinite import earliest, first_nonfinite
+from taic_jax.options.code_book import centres
 from taic_jax.options.dataset import Dataset, Experience, Window, gather, make_dataset
 from taic_jax.options.losses import adversarial_loss, end_loss, gradient_reversal, kl_loss, reconstruction_loss
 from taic_jax.options.model import Networks, OptionModel, init_params, make_networks
@@ -21,6 +23,8 @@ from taic_jax.types import Scalar, as_arrays
 
 DELTA_MEMORY = 100.0
 """Steps over which a quantile threshold is averaged."""
+BOOK_WINDOWS = 4096
+"""Windows whose codes give the code book."""
 
 
 class LearnState(struct.PyTreeNode):
@@ -83,7 +87,7 @@ def window_losses(
     decoded, end_logit = model.decode(option, states[:-1] + disturbance)
     estimated = model.estimate(gradient_reversal(option, config.lambda_adv))
     losses = {
-        "reconstruction_loss": reconstruction_loss(decoded, window.actions, mask),
+        "reconstruction_loss": reconstruction_loss(decoded, window.actions, mask, model.networks.discrete),
         "kl_loss": kl_loss(mean, log_std),
         "prediction_loss": prediction,
         "adversarial_loss": adversarial_loss(estimated, states[0], states[last + 1]),
@@ -170,16 +174,29 @@ def as_model(state: LearnState, dataset: Dataset) -> OptionModel:
     return OptionModel(state.params, dataset.state_scale, dataset.change_scale, state.delta, state.networks)
 
 
+def code_book(config: OptionsConfig, state: LearnState, dataset: Dataset) -> Float[Array, "M D"]:
+    """Return the book of discrete options: the centres of the codes of windows."""
+    model = as_model(state, dataset)
+    key_windows, key_centres = jax.random.split(state.key)
+    many = dataclasses.replace(config, batch_size=BOOK_WINDOWS)
+    windows = _draw(many, dataset, key_windows, jnp.zeros((), jnp.int32), dataset.count)
+    last = jnp.sum(windows.mask, axis=1, dtype=jnp.int32) - 1
+    codes = jax.vmap(lambda actions, last: model.encode(actions)[0][last])(windows.actions, last)
+    return centres(codes, config.codes, key_centres)
+
+
 def learn(
     config: OptionsConfig,
     experience: Experience | Sequence[Experience],
     key: Key[Array, ""],
     views: Views | None = None,
+    discrete: bool = False,
 ) -> tuple[OptionModel, dict[str, Array]]:
     """Learn an option model from experience [T, B, ...]; pure, so experiences and keys may be vmapped.
 
     Several experiences, of tasks that share the body, are merged. Returns the model and the losses of every step,
-    leading axis the step. With `config.views` all, windows have all `views` of the body (`Env.views`).
+    leading axis the step. With `config.views` all, windows have all `views` of the body (`Env.views`). With
+    `discrete` actions are one-hot (`Env.discrete`).
 
     Raises:
       ShortExperienceError: delta is a quantile, and no experience is long enough to hold a part out.
@@ -190,6 +207,7 @@ def learn(
     config = as_arrays(config)
     dataset = make_dataset(experience, config, views)
     rows = dataset.experience
-    networks = make_networks(config, rows.obs.shape[-1], rows.action.shape[-1])
+    networks = make_networks(config, rows.obs.shape[-1], rows.action.shape[-1], discrete)
     state, losses = jax.lax.scan(lambda s, _: step(config, dataset, s), init(config, networks, key), None, config.steps)
-    return as_model(state, dataset), losses
+    model = as_model(state, dataset)
+    return model.replace(book=code_book(config, state, dataset)) if config.codes else model, losses

@@ -12,10 +12,14 @@ from taic_jax.types import Scalar
 
 
 def reconstruction_loss(
-    decoded: Float[Array, "L A"], actions: Float[Array, "L A"], mask: Bool[Array, " L"]
+    decoded: Float[Array, "L A"], actions: Float[Array, "L A"], mask: Bool[Array, " L"], discrete: bool = False
 ) -> Float[Array, ""]:
-    """Return L_Recons (eq. 3): the mean squared error over the window's own actions."""
-    errors = jnp.mean(jnp.square(decoded - actions), axis=-1)
+    """Return L_Recons (eq. 3): the mean squared error over the window's own actions.
+
+    For discrete actions it is the cross-entropy of the logits `decoded`, in nats.
+    """
+    squares = jnp.mean(jnp.square(decoded - actions), axis=-1)
+    errors = optax.softmax_cross_entropy(decoded, actions) if discrete else squares
     return jnp.sum(jnp.where(mask, errors, 0.0)) / jnp.sum(mask, dtype=jnp.float32)
 
 

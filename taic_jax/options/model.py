@@ -161,6 +161,7 @@ class Networks(NamedTuple):
     decoder: OpenDecoder | ClosedDecoder
     predictor: Predictor
     estimator: StateEstimator
+    discrete: bool  # D's output is logits of one-hot actions
 
 
 class Scale(struct.PyTreeNode):
@@ -178,7 +179,8 @@ class Scale(struct.PyTreeNode):
 class OptionModel(struct.PyTreeNode):
     """E, D, P and F with their parameters, and the scales of states and state changes.
 
-    `delta` [] is the error of P at which termination predict ends an option.
+    `delta` [] is the error of P at which termination predict ends an option. `book` [M, D] are the codes of discrete
+    options, None without `options.codes`.
     """
 
     params: dict
@@ -186,6 +188,7 @@ class OptionModel(struct.PyTreeNode):
     change_scale: Scale
     delta: Array
     networks: Networks = struct.field(pytree_node=False)
+    book: Any = None
 
     @property
     def state_size(self) -> int:
@@ -215,8 +218,8 @@ class OptionModel(struct.PyTreeNode):
         return self.replace(params={**self.params, "decoder": params})
 
 
-def make_networks(config: OptionsConfig, state_size: int, action_size: int) -> Networks:
-    """Return the modules for states [P] and actions [A]."""
+def make_networks(config: OptionsConfig, state_size: int, action_size: int, discrete: bool = False) -> Networks:
+    """Return the modules for states [P] and actions [A], which are one-hot if `discrete`."""
     if config.decoder == "closed":
         decoder = ClosedDecoder(action_size, tuple(config.decoder_sizes), config.length)
     else:
@@ -226,6 +229,7 @@ def make_networks(config: OptionsConfig, state_size: int, action_size: int) -> N
         decoder,
         Predictor(state_size, tuple(config.mlp_sizes)),
         StateEstimator(state_size, tuple(config.mlp_sizes)),
+        discrete,
     )
 
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, Key
 
-from taic_jax.networks import Policy, PolicyParams, SquashedParams, SquashedPolicy
+from taic_jax.networks import GreedyParams, GreedyPolicy, Policy, PolicyParams, SquashedParams, SquashedPolicy
 from taic_jax.options.execution import Executor
 from taic_jax.rl import normalize
 from taic_jax.rl.rollout import DecideFn
@@ -39,9 +39,9 @@ class Agent(struct.PyTreeNode):
     """A policy over options with its parameters, and the executor of the options: all that acting needs."""
 
     executor: Executor
-    params: PolicyParams | SquashedParams
+    params: PolicyParams | SquashedParams | GreedyParams
     obs_statistics: normalize.Statistics
-    policy: Policy | SquashedPolicy = struct.field(pytree_node=False)
+    policy: Policy | SquashedPolicy | GreedyPolicy = struct.field(pytree_node=False)
 
     @property
     def observation_size(self) -> int:

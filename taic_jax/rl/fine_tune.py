@@ -133,7 +133,7 @@ def _rows(
     """Return every tick as a row, with the advantage of its action; `running` are the options at the first tick."""
     advantage = semi_markov_advantages(judgement, jnp.ones_like(ticks.ended), config.gamma, config.lambda_)
     model, tick = noisy.model, ticks.duration - 1
-    option = fill_options(ticks.option, ticks.decision, running)
+    option = fill_options(noisy.code(ticks.option), ticks.decision, running)
     proprioception = model.state_scale(ticks.obs[..., : model.state_size])
     means = jax.vmap(jax.vmap(partial(mean_action, model, noisy.length)))(option, proprioception, tick)
     action = means + noisy.std * ticks.noise[..., -means.shape[-1] :]

@@ -1,4 +1,4 @@
-"""The learners of a policy, PPO and SAC, behind the same functions."""
+"""The learners of a policy, PPO, SAC and DQN, behind the same functions."""
 
 from functools import partial
 from types import ModuleType
@@ -6,19 +6,19 @@ from types import ModuleType
 import jax
 from jaxtyping import Array, Key
 
-from taic_jax.config import PPOConfig, SACConfig
+from taic_jax.config import DQNConfig, PPOConfig, SACConfig
 from taic_jax.envs.base import Env
 from taic_jax.options.execution import Executor
-from taic_jax.rl import ppo, sac
+from taic_jax.rl import dqn, ppo, sac
 from taic_jax.rl.agent import Agent
 from taic_jax.types import as_arrays
 
-Settings = PPOConfig | SACConfig
+Settings = PPOConfig | SACConfig | DQNConfig
 
 
 def learner_of(settings: Settings) -> ModuleType:
-    """Return `ppo` or `sac`: modules with the functions `init`, `iterate`, `as_agent` and `make_policy`."""
-    return sac if isinstance(settings, SACConfig) else ppo
+    """Return `ppo`, `sac` or `dqn`: modules with the functions `init`, `iterate`, `as_agent` and `make_policy`."""
+    return {PPOConfig: ppo, SACConfig: sac, DQNConfig: dqn}[type(settings)]
 
 
 def num_iterations(settings: Settings, ticks: int) -> int:

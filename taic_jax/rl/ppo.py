@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from taic_jax.config import PPOConfig
 from taic_jax.envs.base import Env
 from taic_jax.envs.wrappers import AutoReset
-from taic_jax.networks import Policy, PolicyParams
+from taic_jax.networks import CategoricalPolicy, Policy, PolicyParams
 from taic_jax.nonfinite import first_nonfinite
 from taic_jax.options.execution import Executor
 from taic_jax.rl import normalize
@@ -39,7 +39,8 @@ class TrainState(struct.PyTreeNode):
 
 def make_policy(executor: Executor, config: PPOConfig) -> Policy:
     """Return the policy over the executor's options."""
-    return Policy(executor.option_size, tuple(config.hidden_sizes))
+    kind = CategoricalPolicy if executor.discrete else Policy
+    return kind(executor.option_size, tuple(config.hidden_sizes))
 
 
 def init(config: PPOConfig, env: Env, executor: Executor, key: Key[Array, ""]) -> TrainState:

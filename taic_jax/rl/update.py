@@ -59,6 +59,7 @@ def ppo_loss(
     value_loss = 0.5 * jnp.sum(weight * jnp.square(policy.value(params, batch.obs) - batch.target))
     entropy = jnp.sum(weight * distribution.entropy())
     loss = policy_loss + config.value_weight * value_loss - config.entropy_weight * entropy
+    loss = loss + config.prior_weight * jnp.sum(weight * policy.divergence(distribution))
     approx_kl = jnp.sum(weight * (ratio - 1.0 - log_ratio))
     clip_fraction = jnp.sum(weight, where=jnp.abs(ratio - 1.0) > config.clip)
     return loss, jnp.stack([policy_loss, value_loss, entropy, approx_kl, clip_fraction])

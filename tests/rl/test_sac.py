@@ -57,8 +57,8 @@ def learnt():
 
 def test_the_target_is_semi_markov_and_the_gradients_of_the_three_losses_do_not_mix(learnt):
     config, policy, critics, learnt, batch, noise = learnt
-    target = sac.semi_markov_target(policy, critics, learnt, 0.5, batch, noise[0])
-    option, log_prob = policy.draw(learnt.actor, batch.next_obs, 1.0, noise[0])
+    target = sac.semi_markov_target(config, policy, critics, learnt, 0.5, batch, noise[0])
+    option, log_prob = policy.draw(learnt.policy, batch.next_obs, 1.0, noise[0])
     value = critics.values(learnt.targets, batch.next_obs, option / 3).min(axis=0) - 0.5 * log_prob
     np.testing.assert_allclose(target, batch.reward + batch.discount * value, rtol=1e-4)
 
@@ -67,15 +67,15 @@ def test_the_target_is_semi_markov_and_the_gradients_of_the_three_losses_do_not_
         return jnp.mean(errors[0] ** 2) + jnp.mean(errors[1] ** 2)
 
     def actor_loss(actor):
-        option, log_prob = policy.draw(learnt.actor.replace(actor=actor), batch.obs, 1.0, noise[1])
+        option, log_prob = policy.draw(learnt.policy.replace(actor=actor), batch.obs, 1.0, noise[1])
         return jnp.mean(0.5 * log_prob - critics.values(learnt.critics, batch.obs, option / 3).min(axis=0))
 
-    params = learnt.actor.actor, learnt.critics, learnt.log_temperature
+    params = learnt.policy.actor, learnt.critics, learnt.log_temperature
     got, terms = jax.grad(sac.sac_loss, has_aux=True)(params, config, Repeat(3, D), learnt, batch, noise)
     expected = jax.grad(actor_loss)(params[0]), jax.grad(critic_loss)(params[1])
     for x, y in zip(jax.tree.leaves(got[:2]), jax.tree.leaves(expected), strict=True):
         np.testing.assert_allclose(x, y, rtol=1e-3, atol=1e-5)
-    _, log_prob = policy.draw(learnt.actor, batch.obs, 1.0, noise[1])
+    _, log_prob = policy.draw(learnt.policy, batch.obs, 1.0, noise[1])
     np.testing.assert_allclose(got[2], -(log_prob.mean() - D), rtol=1e-4)  # falls while the entropy exceeds -D
     np.testing.assert_allclose(terms[:2], [critic_loss(params[1]), actor_loss(params[0])], rtol=1e-4)
     np.testing.assert_allclose(terms[3:], [-log_prob.mean(), 0.5], rtol=1e-4)
@@ -83,7 +83,7 @@ def test_the_target_is_semi_markov_and_the_gradients_of_the_three_losses_do_not_
 
 def test_targets_follow_the_critics_and_the_step_is_adams_first(learnt):
     config, _, _, learnt, batch, _ = learnt
-    params = learnt.actor.actor, learnt.critics, learnt.log_temperature
+    params = learnt.policy.actor, learnt.critics, learnt.log_temperature
     learnt = learnt.replace(optimizer=sac.make_optimizer().init(params))
     after, _ = sac.update(dataclasses.replace(config, batch_size=M), Repeat(3, D), learnt, batch, jax.random.key(0))
     for old, target, new, critic in zip(
@@ -92,7 +92,7 @@ def test_targets_follow_the_critics_and_the_step_is_adams_first(learnt):
         np.testing.assert_allclose(new, 0.95 * old + 0.05 * critic, rtol=1e-4, atol=1e-6)
         assert np.abs(critic - target).max() <= 3e-3 * 1.001
     np.testing.assert_allclose(abs(after.log_temperature - learnt.log_temperature), 3e-3, rtol=1e-3)
-    assert after.actor.bound == 3.0
+    assert after.policy.bound == 3.0
 
 
 def train(env, executor, ticks: int, **changes):
