@@ -85,6 +85,10 @@ class Policy(struct.PyTreeNode):
         option = distribution.loc + exploration * distribution.scale_diag * noise
         return option, distribution.log_prob(option)
 
+    def mode(self, params: PolicyParams, obs: Float[Array, "*batch S"]) -> Float[Array, "*batch D"]:
+        """Return the mean option for normalised observations."""
+        return apply(self._actor, params.actor, obs)
+
     def divergence(self, distribution: Any) -> Float[Array, "*batch"]:
         """Return KL(pi(o|s) || N(0, I)) in nats."""
         mean = distribution.loc
@@ -109,6 +113,10 @@ class CategoricalPolicy(Policy):
         distribution: Any = self.distribution(params, obs)
         option = one_hot_of(distribution.logits + exploration * gumbel(noise))
         return option, distribution.log_prob(option)
+
+    def mode(self, params: PolicyParams, obs: Float[Array, "*batch S"]) -> Float[Array, "*batch D"]:
+        """Return the most probable option for normalised observations."""
+        return one_hot_of(super().mode(params, obs))
 
     def divergence(self, distribution: Any) -> Float[Array, "*batch"]:
         """Return the KL divergence from uniform options in nats."""
@@ -162,6 +170,10 @@ class SquashedPolicy(struct.PyTreeNode):
         log_prob: Any = normal.log_prob(before)
         return params.bound * squashed, log_prob - log_det
 
+    def mode(self, params: SquashedParams, obs: Float[Array, "*batch S"]) -> Float[Array, "*batch D"]:
+        """Return the mean before squashing, squashed, for normalised observations."""
+        return params.bound * jnp.tanh(jnp.split(apply(self._actor, params.actor, obs), 2, axis=-1)[0])
+
     def uniform(self, params: SquashedParams, noise: Float[Array, "*batch D"]) -> Float[Array, "*batch D"]:
         """Return uniformly random options within the bound, by standard normal noise."""
         return params.bound * (2.0 * jax.scipy.stats.norm.cdf(noise) - 1.0)
@@ -197,12 +209,16 @@ class GreedyPolicy(struct.PyTreeNode):
         self, params: GreedyParams, obs: Float[Array, "*batch S"], exploration: Scalar, noise: Float[Array, "*batch D"]
     ) -> tuple[Float[Array, "*batch D"], Float[Array, "*batch"]]:
         """Return an option by standard normal noise, and its log-probability; `exploration` scales epsilon."""
-        best, epsilon = one_hot_of(self.evaluate(params.values, obs)), exploration * params.epsilon
+        best, epsilon = self.mode(params, obs), exploration * params.epsilon
         # The greatest of the numbers is independent of its place, and its power by its distribution is uniform.
         chance = jax.scipy.stats.norm.cdf(jnp.max(noise, axis=-1)) ** self.option_size
         option = jnp.where((chance < epsilon)[..., None], self.uniform(params, noise), best)
         share = jnp.sum(option * best, axis=-1) * (1.0 - epsilon) + epsilon / self.option_size
         return option, jnp.log(share)
+
+    def mode(self, params: GreedyParams, obs: Float[Array, "*batch S"]) -> Float[Array, "*batch D"]:
+        """Return the best option for normalised observations."""
+        return one_hot_of(self.evaluate(params.values, obs))
 
     def uniform(self, params: GreedyParams, noise: Float[Array, "*batch D"]) -> Float[Array, "*batch D"]:
         """Return uniformly random options by standard normal noise."""

@@ -19,8 +19,8 @@ from taic_jax.rl.normalize import CLIP
 from taic_jax.runtime.checkpoint import plain_arrays
 
 FILES = {"jax": "agent.stablehlo", "onnx": "agent.onnx", "npz": "agent.npz"}
-NETWORKS = ("actor", "decoder", "encoder", "predictor")
-IDLE = {"critic", "log_std", "count", "summed_variance", "estimator"}  # parts of an agent without a part in acting
+NETWORKS = ("actor", "values", "decoder", "encoder", "predictor")
+IDLE = {"critic", "log_std", "epsilon", "count", "summed_variance", "estimator"}  # parts that do not act
 
 
 def tick_of(agent: Agent) -> tuple[Callable[..., tuple[Array, ...]], dict[str, Any]]:
@@ -30,13 +30,14 @@ def tick_of(agent: Agent) -> tuple[Callable[..., tuple[Array, ...]], dict[str, A
     """
     executor: Any = agent.executor
     if isinstance(executor, OptionExecutor):  # without noise an end signal counts from one half on
-        executor = executor.replace(termination=dataclasses.replace(executor.termination, noise_size=0))
+        termination = dataclasses.replace(executor.termination, noise_size=0)
+        executor = executor.replace(termination=termination, std=None)
     agent, obs = agent.replace(executor=executor), jnp.zeros(agent.observation_size)
     start = jax.tree.map(jnp.zeros_like, agent.start(obs).replace(noise=None))
 
     def tick(obs: Array, *carry: Array) -> tuple[Array, ...]:
         acting = jax.tree.unflatten(jax.tree.structure(start), carry).replace(noise=jnp.zeros(0))
-        acting, action, _ = advance(agent, acting, obs, jnp.zeros(executor.option_size))
+        acting, action, _ = advance(agent, acting, obs)
         return action, *jax.tree.leaves(acting.replace(noise=None))
 
     named = {jax.tree_util.keystr(p, simple=True, separator="."): x for p, x in jax.tree.leaves_with_path(start)}

@@ -88,16 +88,26 @@ def _start(agent: Agent, obs: Any) -> Acting:
 @jax.jit
 def _act(agent: Agent, carry: Acting, obs: Any, key: Any) -> tuple[Acting, Array, Tick]:
     size = agent.executor.option_size + agent.executor.noise_size
-    return advance(agent, carry, obs, jnp.zeros(size) if key is None else jax.random.normal(key, (size,)))
+    return advance(agent, carry, obs, None if key is None else jax.random.normal(key, (size,)))
 
 
-def advance(agent: Agent, carry: Acting, obs: ArrayLike, noise: Float[Array, " Z"]) -> tuple[Acting, Array, Tick]:
-    """Do as `Agent.act` with these standard normal numbers: D for the policy, then those of the executor."""
+def advance(
+    agent: Agent, carry: Acting, obs: ArrayLike, noise: Float[Array, " Z"] | None = None
+) -> tuple[Acting, Array, Tick]:
+    """Do as `Agent.act` with these standard normal numbers, those for the policy before those of the executor.
+
+    Without them the policy takes its mean option, and those of the executor are zero.
+    """
     executor, obs = agent.executor, jnp.asarray(obs, jnp.float32)
-    choice, chance = noise[: executor.option_size], noise[executor.option_size :]
+    policy: Any = agent.policy
     ended = executor.ended(carry.running, obs, carry.noise) | (carry.duration >= executor.length)
     began = ended | (carry.duration == 0)
-    option = agent.decide()(obs[None], choice[None])[0][0]
+    if noise is None:
+        option = policy.mode(agent.params, normalize.normalize(agent.obs_statistics, obs))
+        chance = jnp.zeros(executor.noise_size)
+    else:
+        option = agent.decide()(obs[None], noise[None, : executor.option_size])[0][0]
+        chance = noise[executor.option_size :]
     fresh = option, executor.start(option, obs)
     option, running = jax.tree.map(partial(jnp.where, began), fresh, (carry.option, carry.running))
     running, action = executor.act(running, obs, chance)
