@@ -23,6 +23,7 @@ from taic_jax.envs.base import Env, PhysicsState, State
 from taic_jax.envs.contract import check_contract
 from taic_jax.envs.custom import load_custom
 from taic_jax.envs.errors import ContractError, EnvOptionError, MissingExtraError, RenderingError, UnknownNameError
+from taic_jax.envs.grid import FourRooms
 from taic_jax.envs.locomotion import Locomotion
 from taic_jax.envs.navigation import Navigation
 from taic_jax.envs.physics import BACKENDS
@@ -30,8 +31,8 @@ from taic_jax.envs.robots import ROBOTS, with_body
 from taic_jax.envs.wrappers import AutoReset, TimeLimit, Wrapper
 
 __all__ = [
-    "AntArena", "AntTurn", "AutoReset", "BraxEnv", "ContractError", "Env", "EnvOptionError", "Locomotion",
-    "MissingExtraError", "Navigation", "PhysicsState", "PlaygroundEnv", "RenderingError", "State", "TimeLimit",
+    "AntArena", "AntTurn", "AutoReset", "BraxEnv", "ContractError", "Env", "EnvOptionError", "FourRooms",
+    "Locomotion", "MissingExtraError", "Navigation", "PhysicsState", "PlaygroundEnv", "RenderingError", "State", "TimeLimit",
     "UnknownNameError", "Wrapper", "check_contract", "environment_names", "environment_options", "make_env",
 ]  # fmt: skip
 
@@ -53,6 +54,8 @@ def _make_robot(name: str, model: str, backend: str, num_threads: int, body: str
 _TASKS = {
     "nav2d": _Task(Navigation, ("change_after",), has_engine=False),
     "nav2d_random": _Task(partial(Navigation, random_ends=True), has_engine=False),
+    "four_rooms": _Task(FourRooms, has_engine=False),
+    "four_rooms_random": _Task(partial(FourRooms, random_ends=True), has_engine=False),
     **{name: _Task(partial(_make_robot, name), ("model",)) for name in ROBOTS["brax"]},
     "ant": _Task(partial(_make_robot, "ant"), ("model", "body")),  # alone of the robots it has two bodies
     "ant_turn": _Task(partial(AntTurn, "ant_turn", ROBOTS["brax"]["ant"])),

@@ -87,6 +87,7 @@ BREACHES = {
     "sound: dt: got 0, expected a positive number of seconds": Sound(dt=0),
     "sound: dt: got 'fast', expected a positive number of seconds": Sound(dt="fast"),
     "sound: dt: got nan, expected a positive number of seconds": Sound(dt=float("nan")),
+    "sound: discrete: got 1, expected True or False": Sound(discrete=1),
     "Sound: name: got '', expected a string": Sound(name=""),
     "bare: observation_size: is missing": Bare(),
 }
