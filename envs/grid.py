@@ -25,7 +25,7 @@ _MAP = """
 #           #
 #     #     #
 #############
-""".split("\n")[-2:0:-1]
+""".splitlines()[:0:-1]
 FREE = np.array([[place == " " for place in row] for row in _MAP]).T  # [13, 13] by x and y
 CELLS = np.argwhere(FREE).astype(np.int32)  # [104, 2]
 MIDDLE = 6  # of the grid, on both axes; the outer wall is as far away on each side
@@ -112,7 +112,8 @@ class FourRooms(Env):
             target.set_center(goal[t])
             key.set_visible(not has_key[t])
 
-        jumps = np.abs(np.diff(position, axis=0, prepend=position[:1])).sum(axis=1) > 1
+        record = np.concatenate([position, 2 * goal], axis=1)  # a new goal is a jump too
+        jumps = np.abs(np.diff(record, axis=0, prepend=record[:1])).sum(axis=1) > 1
         return plan.film(position, jumps, arrange)
 
     def _observe(self, physics: GridState) -> Float[Array, " 7"]:
@@ -122,4 +123,4 @@ class FourRooms(Env):
     def _metrics(self, physics: GridState) -> dict[str, Array]:
         distance = jnp.sum(jnp.abs(physics.goal - physics.position)).astype(jnp.float32)
         has_key = physics.has_key.astype(jnp.float32)
-        return {"success": has_key * (distance == 0), "distance": distance, "has_key": has_key}
+        return {"success": has_key * (distance == 0).astype(jnp.float32), "distance": distance, "has_key": has_key}
