@@ -117,7 +117,8 @@ class FourRooms(Env):
         return plan.film(position, jumps, arrange)
 
     def _observe(self, physics: GridState) -> Float[Array, " 7"]:
-        position, key, goal = ((cell - MIDDLE) / np.float32(5) for cell in (physics.position, KEY, physics.goal))
+        cells = jnp.stack([physics.position, jnp.array(KEY), physics.goal])
+        position, key, goal = (cells - MIDDLE).astype(jnp.float32) / (MIDDLE - 1)
         return jnp.concatenate([position, physics.has_key[None].astype(jnp.float32), key, goal])
 
     def _metrics(self, physics: GridState) -> dict[str, Array]:

@@ -126,7 +126,7 @@ def test_what_cannot_be_traced_is_told_with_its_line():
     assert str(caught.value).endswith(f" (line {source.co_firstlineno + 1} of {source.co_filename})")
 
 
-@pytest.mark.parametrize("name", ["nav2d", "nav2d_random", "half_cheetah", "ant", "brax:fast"])
+@pytest.mark.parametrize("name", ["nav2d", "nav2d_random", "four_rooms", "half_cheetah", "ant", "brax:fast"])
 def test_our_own_and_braxs_tasks_keep_the_contract(name):
     env = make_env(name, "auto" if name.startswith("brax") else "mujoco")
     check_contract(env)
