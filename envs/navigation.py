@@ -109,7 +109,7 @@ class Navigation(Env):
     def render(self, physics: NavigationState, *, height: int = 240, width: int = 320) -> np.ndarray:
         """Draw room, obstacles, start, goal, and the episode's path; a move too long for a tick is a reset."""
         plan = Plan(0.0, ROOM, height, width)
-        patches = [plan.add_solid(*wall) for wall in np.asarray(self.walls)]
+        patches = [plan.add_solid(*wall) for wall in np.asarray(self.walls).tolist()]
         target = plan.add_disc(GOAL_RADIUS, "#3a9d5d")
         position, goal = np.asarray(physics.position), np.asarray(physics.goal)
         standing = self._standing(np.asarray(physics.episode)[:, None])

@@ -71,7 +71,7 @@ def test_discrete_actions_are_indices():
         np.testing.assert_array_equal(obs, state.obs)
     start, _ = three.reset(seed=7)
     after, *_ = three.step(np.array([0, 1, 2]))
-    state = jax.vmap(env.reset)(jax.random.split(first_key(7), 3))
+    state = jax.vmap(AutoReset(env).reset)(jax.random.split(first_key(7), 3))
     np.testing.assert_array_equal(start, state.obs)
     np.testing.assert_array_equal(after, jax.vmap(env.step)(state, jnp.eye(4)[:3]).obs)
     moves = {
