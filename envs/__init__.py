@@ -16,13 +16,14 @@ from typing import NamedTuple
 if sys.platform == "linux" and "DISPLAY" not in os.environ and ctypes.util.find_library("EGL"):
     os.environ.setdefault("MUJOCO_GL", "egl")
 
-from taic_jax.envs.adapters import BRAX_PREFIX, PLAYGROUND_PREFIX, BraxEnv, PlaygroundEnv
+from taic_jax.envs.adapters import BRAX_PREFIX, GYMNAX_PREFIX, PLAYGROUND_PREFIX, BraxEnv, GymnaxEnv, PlaygroundEnv
 from taic_jax.envs.ant_tasks import AntArena, AntTurn
 from taic_jax.envs.arenas import FALL, MAZE, PUSH
 from taic_jax.envs.base import Env, PhysicsState, State
 from taic_jax.envs.contract import check_contract
 from taic_jax.envs.custom import load_custom
 from taic_jax.envs.errors import ContractError, EnvOptionError, MissingExtraError, RenderingError, UnknownNameError
+from taic_jax.envs.grid import FourRooms
 from taic_jax.envs.locomotion import Locomotion
 from taic_jax.envs.navigation import Navigation
 from taic_jax.envs.physics import BACKENDS
@@ -30,9 +31,10 @@ from taic_jax.envs.robots import ROBOTS, with_body
 from taic_jax.envs.wrappers import AutoReset, TimeLimit, Wrapper
 
 __all__ = [
-    "AntArena", "AntTurn", "AutoReset", "BraxEnv", "ContractError", "Env", "EnvOptionError", "Locomotion",
-    "MissingExtraError", "Navigation", "PhysicsState", "PlaygroundEnv", "RenderingError", "State", "TimeLimit",
-    "UnknownNameError", "Wrapper", "check_contract", "environment_names", "environment_options", "make_env",
+    "AntArena", "AntTurn", "AutoReset", "BraxEnv", "ContractError", "Env", "EnvOptionError", "FourRooms", "GymnaxEnv",
+    "Locomotion", "MissingExtraError", "Navigation", "PhysicsState", "PlaygroundEnv", "RenderingError", "State",
+    "TimeLimit", "UnknownNameError", "Wrapper", "check_contract", "environment_names", "environment_options",
+    "make_env",
 ]  # fmt: skip
 
 
@@ -53,12 +55,19 @@ def _make_robot(name: str, model: str, backend: str, num_threads: int, body: str
 _TASKS = {
     "nav2d": _Task(Navigation, ("change_after",), has_engine=False),
     "nav2d_random": _Task(partial(Navigation, random_ends=True), has_engine=False),
+    "four_rooms": _Task(FourRooms, has_engine=False),
+    "four_rooms_random": _Task(partial(FourRooms, random_ends=True), has_engine=False),
     **{name: _Task(partial(_make_robot, name), ("model",)) for name in ROBOTS["brax"]},
     "ant": _Task(partial(_make_robot, "ant"), ("model", "body")),  # alone of the robots it has two bodies
     "ant_turn": _Task(partial(AntTurn, "ant_turn", ROBOTS["brax"]["ant"])),
     "ant_maze": _Task(partial(AntArena, "ant_maze", MAZE), ("body", "goal")),
     "ant_push": _Task(partial(AntArena, "ant_push", PUSH), ("body",)),
     "ant_fall": _Task(partial(AntArena, "ant_fall", FALL), ("body",)),
+}
+_LIBRARIES = {  # prefix -> a task's constructor, which takes the name after it first
+    BRAX_PREFIX: _Task(BraxEnv, ("pipeline",), has_engine=False),
+    PLAYGROUND_PREFIX: _Task(PlaygroundEnv, has_engine=False),
+    GYMNAX_PREFIX: _Task(GymnaxEnv, has_engine=False),
 }
 
 
@@ -80,8 +89,8 @@ def make_env(
     """Make a task by name, with its time limit.
 
     Args:
-      name: one of `environment_names()`; `brax:NAME` or `playground:NAME` for an environment of those packages;
-        `FILE.py:CLASS` or `MODULE:CLASS` for your own.
+      name: one of `environment_names()`; `brax:NAME`, `playground:NAME` or `gymnax:NAME` for an environment of those
+        packages; `FILE.py:CLASS` or `MODULE:CLASS` for your own.
       backend: physics of the MuJoCo tasks, `auto`, `mujoco`, `mjx` or `warp` (see `physics.make_physics`).
       num_threads: threads of the `mujoco` backend; 0 takes one per physical core.
       pipeline: physics of `brax:NAME`: `spring`, `positional`, `generalized` or `mjx`.
@@ -114,11 +123,10 @@ def make_env(
 def _find(name: str) -> _Task:
     if name in _TASKS:
         return _TASKS[name]
-    if name.startswith(BRAX_PREFIX):
-        return _Task(partial(BraxEnv, name.removeprefix(BRAX_PREFIX)), ("pipeline",), has_engine=False)
-    if name.startswith(PLAYGROUND_PREFIX):
-        return _Task(partial(PlaygroundEnv, name.removeprefix(PLAYGROUND_PREFIX)), has_engine=False)
+    for prefix, library in _LIBRARIES.items():
+        if name.startswith(prefix):
+            return library._replace(make=partial(library.make, name.removeprefix(prefix)))
     if ":" in name:
         return _Task(partial(load_custom, name))
-    others = (f"{BRAX_PREFIX}NAME", f"{PLAYGROUND_PREFIX}NAME", "FILE.py:CLASS")
+    others = (*(f"{prefix}NAME" for prefix in _LIBRARIES), "FILE.py:CLASS")
     raise UnknownNameError("environment", name, (*_TASKS, *others))

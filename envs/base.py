@@ -68,7 +68,10 @@ class Goals(NamedTuple):
 
 
 class Env(abc.ABC):
-    """A task: unbatched and pure, so the caller applies `jax.vmap` and `jax.jit`."""
+    """A task: unbatched and pure, so the caller applies `jax.vmap` and `jax.jit`.
+
+    With `discrete`, A is the number of actions, and an action is one-hot: 1 at the one chosen, 0 elsewhere.
+    """
 
     name: str
     observation_size: int
@@ -77,7 +80,7 @@ class Env(abc.ABC):
     proprioception: str  # name of that slice; without it no other task shares the slice
     episode_length: int  # ticks
     dt: float  # seconds a tick
-    discrete: bool = False  # whether an action is one-hot, one of A
+    discrete: bool = False  # whether an action is one of A, instead of a vector in [-1, 1]^A
 
     @property
     def views(self) -> Views:
@@ -107,7 +110,8 @@ class Env(abc.ABC):
 
     @abc.abstractmethod
     def step(self, state: State, action: Float[Array, " A"]) -> State:
-        """Advance by one tick under an action in [-1, 1]^A, which the caller has clipped."""
+        """Advance by one tick under an action in [-1, 1]^A, which the caller has clipped; a discrete task takes its
+        argmax."""
 
     @abc.abstractmethod
     def render(self, physics: Any, *, height: int = 240, width: int = 320) -> np.ndarray:

@@ -13,8 +13,22 @@ from taic_jax.envs.base import Env, State
 from taic_jax.envs.errors import ContractError
 from taic_jax.envs.wrappers import AutoReset, TimeLimit
 
+
+def _is_size(value: Any) -> bool:
+    return not isinstance(value, bool) and isinstance(value, (int, np.integer)) and bool(value >= 1)
+
+
+def _is_time(value: Any) -> bool:
+    return not isinstance(value, bool) and isinstance(value, (int, float, np.number)) and bool(0 < value < math.inf)
+
+
 _SIZES = ("observation_size", "action_size", "proprioceptive_size", "episode_length")
-_METHODS = ("reset", "step", "render")
+_RULES = {  # attribute -> what it must satisfy, and in words
+    **dict.fromkeys(_SIZES, (_is_size, "an integer of at least 1")),
+    "dt": (_is_time, "a positive number of seconds"),
+    "discrete": (lambda value: isinstance(value, bool), "True or False"),
+    **dict.fromkeys(("reset", "step", "render"), (callable, "a method")),
+}
 
 
 def check_contract(env: Env) -> None:
@@ -40,21 +54,15 @@ def _check_attributes(env: Env) -> None:
     name = getattr(env, "name", None)
     if not isinstance(name, str) or not name:
         raise ContractError(type(env).__name__, "name", f"got {name!r}, expected a string")
-    for field in (*_SIZES, "dt", *_METHODS):
+    for field in _RULES:
         if not hasattr(env, field):
             raise ContractError(name, field, "is missing")
-    for field in _METHODS:
-        if not callable(getattr(env, field)):
-            raise ContractError(name, field, f"got {getattr(env, field)!r}, expected a method")
-    for field in _SIZES:
-        size = getattr(env, field)
-        if isinstance(size, bool) or not isinstance(size, (int, np.integer)) or size < 1:
-            raise ContractError(name, field, f"got {size!r}, expected an integer of at least 1")
+    for field, (is_valid, expected) in _RULES.items():
+        if not is_valid(value := getattr(env, field)):
+            raise ContractError(name, field, f"got {value!r}, expected {expected}")
     if env.proprioceptive_size > env.observation_size:
         problem = f"got {env.proprioceptive_size}, expected at most observation_size, {env.observation_size}"
         raise ContractError(name, "proprioceptive_size", problem)
-    if isinstance(env.dt, bool) or not isinstance(env.dt, (int, float, np.number)) or not 0 < env.dt < math.inf:
-        raise ContractError(name, "dt", f"got {env.dt!r}, expected a positive number of seconds")
 
 
 def _trace(env: Env, method: str, *arguments: Any) -> State:

@@ -8,12 +8,12 @@ from jax import Array
 from jaxtyping import Bool, Float, Int, Key
 
 from taic_jax.envs.base import Env, Goals, State
+from taic_jax.envs.plans import Plan
 
 ROOM = 10.0  # m, side of the room
 MAX_SPEED = 1.0  # m/s on each axis
 GOAL_RADIUS = 0.5  # m
 REWARDS = np.float32(100), np.float32(-1)  # of a tick at the goal, and of any other
-_FLOOR, _WALL, _GOAL, _POINT = "#f4f1ea", "#3d4451", "#3a9d5d", "#d1495b"  # colours of its picture
 CELL = 0.1  # m, raster from which free points are drawn
 START, GOAL = (1.0, 5.0), (9.0, 5.0)  # m, of the task with fixed ends
 
@@ -108,40 +108,19 @@ class Navigation(Env):
 
     def render(self, physics: NavigationState, *, height: int = 240, width: int = 320) -> np.ndarray:
         """Draw room, obstacles, start, goal, and the episode's path; a move too long for a tick is a reset."""
-        from matplotlib.backends.backend_agg import FigureCanvasAgg  # matplotlib takes a while to import
-        from matplotlib.figure import Figure
-        from matplotlib.patches import Circle, Rectangle
-
-        dpi = height / 2.4  # lines and dots grow with the frame
-        figure = Figure(figsize=(width / dpi, height / dpi), dpi=dpi, facecolor="white")
-        canvas = FigureCanvasAgg(figure)
-        axes = figure.add_axes((0.02, 0.02, 0.96, 0.96), xlim=(0, ROOM), ylim=(0, ROOM), aspect="equal")
-        axes.set(xticks=[], yticks=[], facecolor=_FLOOR)
-        for spine in axes.spines.values():
-            spine.set(color=_WALL, linewidth=2)
-        patches = [Rectangle((x, y), right - x, top - y, color=_WALL) for x, y, right, top in np.asarray(self.walls)]
-        target = Circle((0, 0), GOAL_RADIUS, color=_GOAL, alpha=0.6, linewidth=0)
-        for patch in (*patches, target):
-            axes.add_patch(patch)
-        (path,) = axes.plot([], [], color=_POINT, linewidth=1.5, alpha=0.7, solid_capstyle="round")
-        (start,) = axes.plot([], [], "o", markersize=6, markerfacecolor="white", markeredgecolor=_POINT)
-        (point,) = axes.plot([], [], "o", markersize=7, color=_POINT, markeredgecolor="white", clip_on=False)
-        point.set_zorder(9)  # above the walls
-
+        plan = Plan(0.0, ROOM, height, width)
+        patches = [plan.add_solid(*wall) for wall in np.asarray(self.walls).tolist()]
+        target = plan.add_disc(GOAL_RADIUS, "#3a9d5d")
         position, goal = np.asarray(physics.position), np.asarray(physics.goal)
-        standing, begin, frames = self._standing(np.asarray(physics.episode)[:, None]), 0, []
-        for t, here in enumerate(position):
-            if np.abs(here - position[max(t - 1, 0)]).max() > 1.01 * MAX_SPEED * self.dt:
-                begin = t
+        standing = self._standing(np.asarray(physics.episode)[:, None])
+
+        def arrange(t: int) -> None:
             for patch, stands in zip(patches, standing[t], strict=True):
                 patch.set_visible(stands)
             target.set_center(goal[t])
-            path.set_data(*position[begin : t + 1].T)
-            start.set_data(*position[begin : begin + 1].T)
-            point.set_data(*here[:, None])
-            canvas.draw()
-            frames.append(np.asarray(canvas.buffer_rgba())[..., :3].copy())
-        return np.stack(frames)
+
+        moves = np.abs(np.diff(position, axis=0, prepend=position[:1])).max(axis=1)
+        return plan.film(position, moves > 1.01 * MAX_SPEED * self.dt, arrange)
 
     def _observe(self, physics: NavigationState) -> Float[Array, " S"]:
         points = [physics.position, physics.goal] if self.random_ends else [physics.position]

@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING
 
 from taic_jax.envs.adapters.admission import extra
 from taic_jax.envs.adapters.brax import BRAX_PREFIX, BraxEnv
+from taic_jax.envs.adapters.gymnax import GYMNAX_PREFIX, GymnaxEnv
 from taic_jax.envs.adapters.playground import PLAYGROUND_PREFIX, PlaygroundEnv
 from taic_jax.envs.base import Env
 from taic_jax.envs.third_party import third_party
@@ -13,7 +14,8 @@ if TYPE_CHECKING:
     from taic_jax.envs.adapters.gymnasium_export import GymnasiumExport, GymnasiumVectorExport
 
 __all__ = [
-    "BRAX_PREFIX", "PLAYGROUND_PREFIX", "BraxEnv", "PlaygroundEnv", "to_brax", "to_gymnasium", "to_gymnasium_vector",
+    "BRAX_PREFIX", "GYMNAX_PREFIX", "PLAYGROUND_PREFIX", "BraxEnv", "GymnaxEnv", "PlaygroundEnv", "to_brax",
+    "to_gymnasium", "to_gymnasium_vector",
 ]  # fmt: skip
 
 
@@ -22,7 +24,8 @@ def to_brax(env: Env) -> "BraxExport":
 
     Brax counts the ticks, in its `EpisodeWrapper`: a `TimeLimit` around `env` is removed, and its number stays as
     `episode_length`: `training.wrap(to_brax(env), env.episode_length)`. At an episode's end Brax goes back to the
-    copy's first state: starts do not vary, and a task's `restart` has no effect. With JAX 0.10, Brax 0.14.2's PPO
+    copy's first state: starts do not vary, and a task's `restart` has no effect. Brax has no discrete actions: of a
+    vector [A], the largest entry counts. With JAX 0.10, Brax 0.14.2's PPO
     stops, for any environment, at a function that JAX no longer has (`device_put_replicated`); its wrappers work.
 
     Raises:
@@ -37,6 +40,7 @@ def to_brax(env: Env) -> "BraxExport":
 def to_gymnasium(env: Env, render_mode: str | None = None) -> "GymnasiumExport":
     """Turn an environment of ours into a `gymnasium.Env`: NumPy in and out, compiled, with the metrics as info.
 
+    Actions are a `Box`, or `Discrete(A)` if they are discrete.
     `truncated` comes from the `TimeLimit` that `make_env` puts around a task. `render_mode` is `rgb_array` or None.
 
     Raises:

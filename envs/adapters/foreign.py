@@ -75,13 +75,13 @@ class ForeignEnv(Env):
     def _from_library(self, state: Any) -> State:
         parts = dict(state.obs) if self._in_parts else {"state": state.obs}
         obs = parts.pop("state")
-        physics = jax.tree.map(_strong, ForeignPhysics(getattr(state, self._simulation), state.info, parts))
+        physics = jax.tree.map(strong, ForeignPhysics(getattr(state, self._simulation), state.info, parts))
         obs, reward = jnp.asarray(obs, jnp.float32), jnp.asarray(state.reward, jnp.float32)
         metrics = {name: jnp.asarray(value, jnp.float32) for name, value in state.metrics.items()}
         return State.first(physics, obs, metrics).replace(reward=reward, terminated=jnp.asarray(state.done, bool))
 
 
-def _strong(leaf: Any) -> Array:
+def strong(leaf: Any) -> Array:
     """Return an array of strong dtype, so that reset and step return the same types."""
     array = jnp.asarray(leaf)
     return jax.lax.convert_element_type(array, array.dtype)

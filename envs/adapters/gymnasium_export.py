@@ -18,6 +18,7 @@ from taic_jax.envs.errors import AdapterError, UnknownNameError
 from taic_jax.envs.wrappers import AutoReset
 
 RENDER_MODES = ("rgb_array",)
+Action = np.ndarray | np.integer | int
 
 
 class _Export:
@@ -29,15 +30,16 @@ class _Export:
     _step: Callable[[State, np.ndarray], State]
     _state: State | None = None
 
-    def _admit(self, adapter: str, env: Env, render_mode: str | None) -> tuple[gymnasium.spaces.Box, ...]:
-        """Set the metadata, and return the spaces of obs [S] and action [A]; refuse another library's environment, or
-        an unknown render mode."""
+    def _admit(self, adapter: str, env: Env, render_mode: str | None) -> tuple[gymnasium.Space, gymnasium.Space]:
+        """Set the metadata, and return the spaces of obs [S] and action, [A] or discrete; refuse another library's
+        environment, or an unknown render mode."""
         require_task(adapter, env)
         if render_mode not in (None, *RENDER_MODES):
             raise UnknownNameError("render mode", str(render_mode), RENDER_MODES)
         self.metadata, self.render_mode = {"render_modes": list(RENDER_MODES), "render_fps": 1.0 / env.dt}, render_mode
         limits = (np.inf, env.observation_size), (1.0, env.action_size)
-        return tuple(gymnasium.spaces.Box(-limit, limit, (size,), np.float32) for limit, size in limits)
+        obs, action = (gymnasium.spaces.Box(-limit, limit, (size,), np.float32) for limit, size in limits)
+        return obs, gymnasium.spaces.Discrete(env.action_size) if env.discrete else action
 
     def _draw_key(self) -> Array:
         return jax.random.key(int(self.np_random.integers(2**31)))
@@ -51,17 +53,24 @@ class _Export:
         """Draw one state alone, without the path to it."""
         return self.env.render(jax.tree.map(lambda leaf: leaf[None], physics))[0]
 
-    def _advance(self, action: np.ndarray) -> tuple[Any, ...]:
-        """Make one tick; return obs, reward, terminated, truncated and metrics as arrays of the caller's own."""
-        before, action = self._present(), np.asarray(action, np.float32)
+    def _to_ours(self, action: Action) -> np.ndarray:
+        """Return one action or N of them as vectors [..., A], one-hot if they are discrete."""
+        discrete, last = self.env.discrete, self.env.action_size - 1
+        action = np.asarray(action, None if discrete else np.float32)
         if action.shape != (shape := self.action_space.shape):
             raise AdapterError(f"{self.env.name}: action: got the shape {action.shape}, expected {shape}")
-        self._state = state = self._step(before, action)
+        if discrete and (action.dtype.kind not in "iu" or ((action < 0) | (action > last)).any()):
+            raise AdapterError(f"{self.env.name}: action: got {action}, expected integers from 0 to {last}")
+        return np.eye(last + 1, dtype=np.float32)[action] if discrete else action
+
+    def _advance(self, action: Action) -> tuple[Any, ...]:
+        """Make one tick; return obs, reward, terminated, truncated and metrics as arrays of the caller's own."""
+        self._state = state = self._step(self._present(), self._to_ours(action))
         outputs = state.obs, state.reward, state.terminated, state.truncated, state.metrics
         return jax.tree.map(np.array, jax.device_get(outputs))
 
 
-class GymnasiumExport(_Export, gymnasium.Env[np.ndarray, np.ndarray]):
+class GymnasiumExport(_Export, gymnasium.Env[np.ndarray, Action]):
     """An environment of ours as a `gymnasium.Env` (see `to_gymnasium`); actions are clipped to [-1, 1]."""
 
     def __init__(self, env: Env, render_mode: str | None = None):
@@ -83,8 +92,8 @@ class GymnasiumExport(_Export, gymnasium.Env[np.ndarray, np.ndarray]):
         self._state = state = self._reset(key) if before is None else self._restart(key, before.physics)
         return np.array(state.obs), _floats(state.metrics)
 
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Make one tick under an action [A]; `AdapterError` at another shape, `ResetNeeded` before a reset."""
+    def step(self, action: Action) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Make one tick; `AdapterError` at an action of another shape or range, `ResetNeeded` before a reset."""
         obs, reward, terminated, truncated, metrics = self._advance(action)
         return obs, float(reward), bool(terminated), bool(truncated), _floats(metrics)
 
@@ -120,7 +129,7 @@ class GymnasiumVectorExport(_Export, gymnasium.vector.VectorEnv[np.ndarray, np.n
         return np.array(state.obs), _masked(jax.device_get(state.metrics), np.ones(self.num_envs, bool))
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Make one tick in every copy under actions [N, A], with the same errors; an end starts the next episode."""
+        """Make one tick in every copy under actions [N, A] or [N]; the same errors; an end starts the next episode."""
         obs, reward, terminated, truncated, metrics = self._advance(actions)
         ended = terminated | truncated
         infos: dict[str, Any] = _masked(metrics, ~ended)  # an episode that starts in this tick has no metrics

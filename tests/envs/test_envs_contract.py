@@ -87,6 +87,7 @@ BREACHES = {
     "sound: dt: got 0, expected a positive number of seconds": Sound(dt=0),
     "sound: dt: got 'fast', expected a positive number of seconds": Sound(dt="fast"),
     "sound: dt: got nan, expected a positive number of seconds": Sound(dt=float("nan")),
+    "sound: discrete: got 1, expected True or False": Sound(discrete=1),
     "Sound: name: got '', expected a string": Sound(name=""),
     "bare: observation_size: is missing": Bare(),
 }
@@ -125,7 +126,7 @@ def test_what_cannot_be_traced_is_told_with_its_line():
     assert str(caught.value).endswith(f" (line {source.co_firstlineno + 1} of {source.co_filename})")
 
 
-@pytest.mark.parametrize("name", ["nav2d", "nav2d_random", "half_cheetah", "ant", "brax:fast"])
+@pytest.mark.parametrize("name", ["nav2d", "nav2d_random", "four_rooms", "half_cheetah", "ant", "brax:fast"])
 def test_our_own_and_braxs_tasks_keep_the_contract(name):
     env = make_env(name, "auto" if name.startswith("brax") else "mujoco")
     check_contract(env)

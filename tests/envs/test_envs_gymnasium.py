@@ -23,7 +23,7 @@ def first_key(seed: int):
     return jax.random.key(int(np_random(seed)[0].integers(2**31)))
 
 
-@pytest.mark.parametrize("name", ["nav2d", "half_cheetah"])
+@pytest.mark.parametrize("name", ["nav2d", "half_cheetah", "four_rooms"])
 def test_gymnasiums_own_checker_passes(name):
     """It finds fault only with obs that has no limits."""
     env = to_gymnasium(make_env(name, "mujoco"), "rgb_array")
@@ -55,6 +55,37 @@ def test_one_environment_gives_our_own_numbers():
         assert (reward, terminated, truncated) == (float(state.reward), False, tick == 4)
         assert type(reward) is float and type(terminated) is type(truncated) is bool
         assert info == {name: float(value) for name, value in state.metrics.items()}
+
+
+def test_discrete_actions_are_indices():
+    """One copy and three, by our own one-hot actions; Gymnasium draws them as Python's or NumPy's integers."""
+    env = make_env("four_rooms")
+    one, three = to_gymnasium(env), to_gymnasium_vector(env, 3)
+    assert one.action_space == gymnasium.spaces.Discrete(4) == three.single_action_space
+    assert three.action_space == gymnasium.spaces.MultiDiscrete([4, 4, 4])
+    obs, _ = one.reset(seed=2)
+    state, step = env.reset(first_key(2)), jax.jit(env.step)
+    for action in (0, np.int64(3), np.array(1), one.action_space.sample()):
+        state = step(state, jax.nn.one_hot(int(action), 4))
+        obs, *_ = one.step(action)
+        np.testing.assert_array_equal(obs, state.obs)
+    start, _ = three.reset(seed=7)
+    after, *_ = three.step(np.array([0, 1, 2]))
+    state = jax.vmap(AutoReset(env).reset)(jax.random.split(first_key(7), 3))
+    np.testing.assert_array_equal(start, state.obs)
+    np.testing.assert_array_equal(after, jax.vmap(env.step)(state, jnp.eye(4)[:3]).obs)
+    moves = {
+        (4,): "four_rooms: action: got the shape (4,), expected ()",
+        -1: "four_rooms: action: got -1, expected integers from 0 to 3",
+        4: "four_rooms: action: got 4, expected integers from 0 to 3",
+        1.0: "four_rooms: action: got 1.0, expected integers from 0 to 3",
+    }
+    for move, message in moves.items():
+        with pytest.raises(AdapterError) as caught:
+            one.step(np.zeros(move) if isinstance(move, tuple) else np.array(move))
+        assert str(caught.value) == message
+    with pytest.raises(AdapterError, match=r"action: got \[0 0 9\], expected integers from 0 to 3$"):
+        three.step(np.array([0, 0, 9]))
 
 
 class Episodes(Env):
