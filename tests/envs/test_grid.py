@@ -172,9 +172,10 @@ def where(frame, color):
 
 
 def test_the_picture_shows_goal_walker_and_the_key_until_it_is_fetched():
-    physics = jax.tree.map(lambda *leaves: np.stack(leaves), *[s.physics for s in walk((1, 9), (RIGHT, 1), (UP, 1))])
-    before, after = ENV.render(physics, height=220, width=220)
-    # Discs of 60 % colour on the floor, #f4f1ea; the walker's dot covers the key, which is gone by then.
+    states = walk((1, 9), (RIGHT, 1), (UP, 1), (RIGHT, 2))
+    physics = jax.tree.map(lambda *leaves: np.stack(leaves), *[state.physics for state in states])
+    before, *_, after = ENV.render(physics, height=220, width=220)
+    # Discs of 60 % colour on the floor, #f4f1ea.
     gold, green = (0.6 * np.array(color) + 0.4 * np.array([244, 241, 234]) for color in ((217, 154, 28), (58, 157, 93)))
     red = np.array([209, 73, 91])
     for frame in (before, after):
