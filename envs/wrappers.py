@@ -17,7 +17,7 @@ class Wrapper(Env):
     """An environment around another, with the inner one's attributes and methods."""
 
     def __init__(self, env: Env):
-        self.env, self.discrete = env, env.discrete  # the latter has a default, so that `__getattr__` is not asked
+        self.env = env
 
     def __getattr__(self, name: str) -> Any:
         if name == "env":  # not yet set, as while unpickling
