@@ -2,6 +2,7 @@
 
 import dataclasses
 from functools import partial
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +23,7 @@ from tiny_runs import (
 
 import taic_jax as taic
 from taic_jax.artifacts.models import load_options
-from taic_jax.config import ConfigError, OptionsConfig, PPOConfig
+from taic_jax.config import Config, ConfigError, OptionsConfig, PPOConfig
 from taic_jax.config.checks import validate
 from taic_jax.options.dataset import Window, gather
 from taic_jax.options.execution import make_executor
@@ -113,8 +114,8 @@ def test_the_weight_holds_the_actions_of_codes_in_use(decoder):
         states = before.state_scale(windows.states[:, :-1])
         old, new = (jax.vmap(model.decode)(codes, states)[0] for model in (before, after))
         changes.append(np.mean((old - new)[windows.mask] ** 2))
-        # Measured before the last step, on some of the windows, and as a mean over options in place of ticks.
-        assert 0.2 < metrics["refresh_change"] / changes[-1] < 5
+        if weight == 0.0:  # measured before the last step, on some windows, and as a mean over options, not ticks
+            assert 0.5 < metrics["refresh_change"] / changes[0] < 2
     assert changes[1] < 0.02 * changes[0] and changes[0] > 0.1
 
 
@@ -153,8 +154,8 @@ def test_without_a_whole_option_nothing_changes():
     for rollout, same in ((none, True), (ticks, False)):
         after, metrics = jax.jit(partial(refresh.refresh, options, executor.model))(rollout, learnt)
         assert np.isnan(metrics["refresh_kl_loss"]) == same
-        moved = zip(numbers(learnt), numbers(after), strict=True)
-        assert all(np.array_equal(a, b) for a, b in moved) == same
+        for was, now in ((learnt.key, after.key), (learnt.params, after.params)):
+            assert all(np.array_equal(a, b) for a, b in zip(numbers(was), numbers(now), strict=True)) == same
 
 
 def test_a_step_is_so_many_iterations_over_the_options_learnt_so_far_and_then_a_refresh_by_their_ticks():
@@ -187,41 +188,49 @@ def test_frozen_options_are_trained_as_before():
     assert type(make_trainer("train", env, frozen, model)) is OptionTrainer
 
 
-@pytest.mark.parametrize("learner", ["ppo", "sac"])
-def test_a_run_refreshes_in_turns_and_goes_on_where_it_stopped(learner, tmp_path, monkeypatch):
-    config = with_fields(REFRESHED, train__learner=learner)
+@pytest.fixture(scope="module", params=["ppo", "sac"])
+def finished(request, tmp_path_factory) -> tuple[Config, Path]:
+    """Return a config and the folder of its run, which nothing interrupted."""
+    config, folder = with_fields(REFRESHED, train__learner=request.param), tmp_path_factory.mktemp("runs") / "whole"
     with tiny_steps():
-        taic.run_pipeline(config, tmp_path / "whole", quiet=True)
+        taic.run_pipeline(config, folder, quiet=True)
+    return config, folder
+
+
+def test_an_interrupted_run_ends_as_if_it_had_not_been(finished, tmp_path, monkeypatch):
+    config, whole = finished
+    with tiny_steps():
         die(monkeypatch, Checkpoints, "save", 3 + 2 + 2)  # after collect's and learn's, in the last step of train
         with pytest.raises(KilledError):
-            taic.run_pipeline(config, tmp_path / "torn", quiet=True)
+            taic.run_pipeline(config, tmp_path, quiet=True)
         monkeypatch.undo()
-        taic.run_pipeline(config, tmp_path / "torn", resume=True, quiet=True)
-    assert_same_arrays(*(last_state(tmp_path / name, "train") for name in ("whole", "torn")))
-    assert rows_of(tmp_path / "whole") == rows_of(tmp_path / "torn")
-    assert methods_of(tmp_path / "whole") == methods_of(tmp_path / "torn")
-    rows = [row for row in rows_of(tmp_path / "whole") if row["stage"] == "train"]
+    with tiny_steps():
+        taic.run_pipeline(config, tmp_path, resume=True, quiet=True)
+    assert_same_arrays(*(last_state(folder, "train") for folder in (whole, tmp_path)))
+    assert rows_of(whole) == rows_of(tmp_path) and methods_of(whole) == methods_of(tmp_path)
+
+
+def test_the_agents_act_with_the_refreshed_options_and_the_artifact_stays_as_it_was_learnt(finished):
+    config, whole = finished
+    rows = [row for row in rows_of(whole) if row["stage"] == "train"]
     assert [row["ticks"] for row in rows] == [32, 64] and all("train/refresh_change" in row for row in rows)
-    env = taic.make_env("nav2d")
-    learnt, agents = (load_options(tmp_path / "whole" / name, env, config.options, 2)
-                      for name in ("options", "agents/taic"))  # fmt: skip
-    loaded = taic.load(tmp_path / "whole").agents["taic"].rows.executor.model
-    assert_trees_equal(agents, loaded)
-    last = last_state(tmp_path / "whole", "train")
+    env, last = taic.make_env("nav2d"), last_state(whole, "train")
+    learnt, refreshed = (load_options(whole / name, env, config.options, 2) for name in ("options", "agents/taic"))
+    assert_trees_equal(refreshed, taic.load(whole).agents["taic"].rows.executor.model)
     for name in learnt.params:
-        pairs = zip(numbers(learnt.params[name]), numbers(agents.params[name]), strict=True)
-        assert not all((a == b).all() for a, b in pairs), name
-    assert any(np.array_equal(x, numbers(agents.params["predictor"])[1]) for x in last.values())
-    assert_trees_equal((learnt.state_scale, learnt.delta), (agents.state_scale, agents.delta))
+        for was, now in zip(numbers(learnt.params[name]), numbers(refreshed.params[name]), strict=True):
+            assert any(np.array_equal(now, x) for x in last.values())
+            assert now.ndim < 3 or not np.array_equal(was, now)
+    assert_trees_equal((learnt.state_scale, learnt.delta), (refreshed.state_scale, refreshed.delta))
 
 
-def test_weights_are_swept_in_one_program(tmp_path):
-    points = [with_fields(REFRESHED, options__refresh_weight=weight) for weight in (0.0, 1e4)]
-    taic.run_pipeline(REFRESHED, tmp_path / "sweep", points=points, quiet=True)
-    taic.run_pipeline(points[1], tmp_path / "alone", quiet=True)
-    swept, alone = (last_state(tmp_path / name, "train") for name in ("sweep", "alone"))
-    name = next(name for name in alone if "decoder" in name and name.endswith("kernel") and "params" in name)
-    np.testing.assert_allclose(swept[name][2:], alone[name], rtol=1e-2, atol=1e-4)
+def test_weights_are_swept_in_one_program(finished, tmp_path):
+    config, whole = finished
+    points = [config, with_fields(config, options__refresh_weight=1e4)]
+    taic.run_pipeline(config, tmp_path, points=points, quiet=True)
+    swept, alone = last_state(tmp_path, "train"), last_state(whole, "train")
+    (name,) = (x for x in alone if "1.params" in x and "decoder" in x and "first" in x and x.endswith("kernel"))
+    np.testing.assert_allclose(swept[name][:2], alone[name], rtol=1e-2, atol=1e-4)
     assert np.abs(swept[name][:2] - swept[name][2:]).max() > 1e-3
 
 
