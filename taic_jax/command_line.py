@@ -71,7 +71,7 @@ class Command:
     """Split over devices (accelerators, or the cores of a CPU): the seeds of all points, or the environments of each
     seed; auto splits the seeds where there are several."""
     options: Annotated[str, tyro.conf.arg(metavar="RUN")] = ""
-    """Run or artifact whose option model is used unchanged; short for --options.source."""
+    """Run or artifact whose option model is used; short for --options.source."""
     init: Annotated[str, tyro.conf.arg(metavar="RUN")] = ""
     """Run whose policy over options is trained further; short for --train.init and --options.source."""
     config: Annotated[Config, tyro.conf.arg(name=""), tyro.conf.FlagConversionOff] = Config()

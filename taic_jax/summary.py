@@ -52,6 +52,8 @@ def plan(config: Config, env: Env, source: Env) -> str:
     lines = []
     for stage, task, learner, ticks in rows:
         iterations = num_iterations(learner, ticks)
+        if stage == "train" and options.refresh_every:
+            iterations -= iterations % options.refresh_every
         real = iterations * learner.num_envs * learner.rollout_length
         lines.append(f"{stage:8} {task.name}: {real:,} ticks x {config.seeds} seeds in {iterations} iterations")
     names = ", ".join(options.experience or (COLLECT,))

@@ -19,7 +19,7 @@ from taic_jax.options.dataset import Dataset, Experience
 from taic_jax.options.execution import Executor, IdentityExecutor, OptionExecutor, make_executor
 from taic_jax.options.learning import LearnState
 from taic_jax.options.model import OptionModel, make_networks
-from taic_jax.rl import fine_tune, normalize, ppo
+from taic_jax.rl import fine_tune, normalize, ppo, refresh
 from taic_jax.rl.agent import Agent
 from taic_jax.rl.fine_tune import Tuned
 from taic_jax.rl.learner import Settings, learner_of, num_iterations
@@ -127,6 +127,42 @@ class FineTuneTrainer(OptionTrainer):
         return ppo.as_agent(self.config.train.ppo, fine_tune.tuned_executor(self.executor, tuned.decoder), policy)
 
 
+class RefreshTrainer(OptionTrainer):
+    """A policy over options that are learnt further from its own: so many iterations and a refresh are one step."""
+
+    @property
+    def unit(self) -> int:
+        """Ticks of one step."""
+        return super().unit * self.config.options.refresh_every
+
+    @property
+    def num_steps(self) -> int:
+        """Whole steps in the budget of ticks."""
+        return super().num_steps // self.config.options.refresh_every
+
+    def init(self, key: Array) -> tuple[Any, LearnState]:
+        """Return the state of an untrained policy, and the learnt options."""
+        learnt = refresh.init(self.config.options, self.executor.model, jax.random.fold_in(key, 1))
+        return super().init(key), learnt
+
+    def begin(self, state: Any, params: PolicyParams, statistics: normalize.Statistics) -> Any:
+        """Do so with the policy; the options are those of the model."""
+        return super().begin(state[0], params, statistics), state[1]
+
+    def step(self, state: Any) -> tuple[Any, dict, None]:
+        """Run the iterations of the policy, then refresh; return the next states and the metrics of both."""
+        options = self.config.options
+        iterations = self.num_steps * options.refresh_every
+        policy, learnt, metrics = refresh.iterate(options, self.settings, self.env, self.executor, iterations, *state)
+        return (policy, learnt), metrics, None
+
+    def agent(self, state: Any) -> Agent:
+        """Return the policy over the refreshed options."""
+        policy, learnt = state
+        executor = refresh.refreshed_executor(self.executor, learnt)
+        return learner_of(self.settings).as_agent(self.settings, executor, policy)
+
+
 Row = tuple[Config, OptionModel | None]
 """The arrays that set one trainer apart from another of its stage; rows [K] have a leading axis."""
 
@@ -134,7 +170,8 @@ Row = tuple[Config, OptionModel | None]
 def make_trainer(stage: str, env: Env, config: Config, model: OptionModel | None = None) -> Trainer:
     """Return the trainer of a stage: `collect`, `train` over a model's options, or one of `train.baselines`."""
     if model is not None:
-        kind = FineTuneTrainer if config.train.fine_tune.epochs else OptionTrainer
+        kind = RefreshTrainer if config.options.refresh_every else OptionTrainer
+        kind = FineTuneTrainer if config.train.fine_tune.epochs else kind
         return kind(env, config, config.train.ticks, model=model)
     ticks = {COLLECT: config.collect.ticks, "total": config.collect.ticks + config.train.ticks}
     hold = config.options.length if stage == "repeat" else 1

@@ -78,7 +78,7 @@ class OptionsConfig:
     """Stage learn: the option model, networks E, D, P and F (sections 3.2 to 3.4)."""
 
     source: str = ""
-    """Run or artifact whose option model is used unchanged (--options for short); empty learns one."""
+    """Run or artifact whose option model is used (--options for short); empty learns one."""
     experience: tuple[str, ...] = ()
     """Sources to learn from: collect, folders of other runs, demonstrations (.npz, Minari); empty takes collect."""
     length: int = 5
@@ -141,6 +141,12 @@ class OptionsConfig:
     of any value."""
     sample_actions: bool = False
     """Draw discrete actions by the probabilities that D gives them; otherwise take the most probable."""
+    refresh_every: Natural = 0
+    """Iterations of stage train after which E, D, P and F are learnt further from the policy's own options; 0 never."""
+    refresh_steps: int = 100
+    """Gradient steps of a refresh."""
+    refresh_weight: float = 1.0
+    """Weight of the mean squared change that a refresh makes to D's actions, for the codes in use."""
 
 
 @dataclass(frozen=True)

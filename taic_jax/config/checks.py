@@ -29,6 +29,9 @@ def validate(config: Config) -> None:
         raise impossible(
             "options.source", repr(options.source), "the run that train.init names", repr(config.train.init)
         )
+    if options.refresh_every and config.train.fine_tune.epochs:
+        expected = "0 with train.fine_tune.epochs, which changes D too"
+        raise impossible("options.refresh_every", options.refresh_every, expected, 0)
     _check_learners(config)
     if "transfer" in baselines and not options.source:
         expected = "with transfer a run with options and a flat policy"
@@ -78,7 +81,7 @@ def _check_limits(config: Config) -> None:
     values, baselines = dict(walk(config)), config.train.baselines
     flat, over_options = f"collect.{config.collect.learner}", f"train.{config.train.learner}"
     collected, trained = (f"{x}.num_envs * {x}.rollout_length" for x in (flat, over_options))
-    by_ppo = over_options == "train.ppo"
+    by_ppo, refreshes = over_options == "train.ppo", config.options.refresh_every
     for applies, name, allowed, expected, other in (
         (flat == "collect.ppo", "collect.ppo.minibatch_size", le, "at most", collected),
         (True, "collect.ticks", ge, "at least one iteration,", collected),
@@ -86,6 +89,7 @@ def _check_limits(config: Config) -> None:
         *((True, f"{x}.update_every", le, "at most", f"{x}.rollout_length") for x in REPLAYS),
         (config.train.fine_tune.epochs, "train.fine_tune.minibatch_size", le, "at most", trained),
         (True, "train.ticks", ge, "at least one iteration,", trained),
+        (refreshes, "train.ticks", ge, "at least one refresh,", f"{trained} * options.refresh_every"),
         (by_ppo, "options.length", le, "at most", "train.ppo.rollout_length"),
         (True, "options.shortest", le, "at most", "options.length"),
         ("repeat" in baselines, "options.length", le, "with baseline repeat at most", f"{flat}.rollout_length"),

@@ -98,7 +98,7 @@ def make_dataset(
     group = jnp.where(selected, held_out[order].astype(jnp.int32), 2)
     starts = order[jnp.argsort(group, stable=True)]
     count, num_held_out = jnp.sum(group == 0, dtype=jnp.int32), jnp.sum(group == 1, dtype=jnp.int32)
-    rows: Any = jax.tree.map(lambda *x: jnp.concatenate([_flatten(y) for y in x]), *sources)
+    rows: Any = jax.tree.map(lambda *x: jnp.concatenate([flatten(y) for y in x]), *sources)
     probe = starts[(jnp.arange(100_000.0) * (count.astype(jnp.float32) / 1e5)).astype(jnp.int32)]
     if views is None or config.views == "one":
         views = one_view(rows.obs.shape[-1], rows.action.shape[-1])
@@ -125,7 +125,7 @@ def _candidates(experience: Experience, config: OptionsConfig, first_part: int) 
     held_out = (tick // (STRETCH * config.length)) % HELD_OUT_EVERY == HELD_OUT_EVERY - 1
     held_out = held_out & holds_out(config)
     return (
-        _flatten(jnp.where(valid, score, jnp.nan)),
+        flatten(jnp.where(valid, score, jnp.nan)),
         jnp.tile(first_part + jnp.clip(part, 0, config.parts - 1), num_envs),
         jnp.tile(held_out, num_envs),
     )
@@ -144,8 +144,8 @@ def _select(
     return order, (rank < quota[part]) & (part < num_parts)
 
 
-def _flatten(x: Array) -> Array:
-    """Join T and B, one environment after another."""
+def flatten(x: Array) -> Array:
+    """Join the axes T and B to rows, one environment after another."""
     return jnp.swapaxes(x, 0, 1).reshape((-1, *x.shape[2:]))
 
 

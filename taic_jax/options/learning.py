@@ -1,7 +1,7 @@
 """Option learning from windows: E, D, P and F jointly (§3.2-3.4, Algorithm 1)."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -25,6 +25,8 @@ DELTA_MEMORY = 100.0
 """Steps over which a quantile threshold is averaged."""
 BOOK_WINDOWS = 4096
 """Windows whose codes give the code book."""
+LossFn = Callable[..., tuple[Array, dict[str, Array]]]
+"""(parameters, model, config, windows, ...) -> the sum to descend, and its terms."""
 
 
 class LearnState(struct.PyTreeNode):
@@ -67,15 +69,15 @@ def window_losses(
 
     E descends the sum L_recons + lambda_kl L_KL + lambda_pred L_pred - lambda_adv L_adv (and, if D emits an end signal,
     lambda_end times its loss), and F descends L_adv: the reversal in front of F changes the sign on its way into E and
-    nowhere else. Under termination predict Algorithm 1 cuts the window, and L_pred is the sum over the prefixes up to
-    there; otherwise L_pred is of the whole window.
+    nowhere else. Under termination predict Algorithm 1 cuts the window further, and L_pred is the sum over the prefixes
+    up to there; otherwise L_pred is of the whole window.
     """
     means, log_stds = model.encode(window.actions)
     last = jnp.sum(window.mask, dtype=jnp.int32) - 1
     mask = window.mask
     if config.termination == "predict":
         errors = prefix_errors(model, means + jnp.exp(log_stds) * noise[None], window.states)
-        last = stop_index(errors, model.delta)
+        last = jnp.minimum(last, stop_index(errors, model.delta))
         mask = jnp.arange(len(errors)) <= last
         prediction = jnp.sum(jnp.where(mask, errors, 0.0))
     mean, log_std = means[last], log_stds[last]
@@ -118,20 +120,36 @@ def step(config: OptionsConfig, dataset: Dataset, state: LearnState) -> tuple[Le
     if config.termination == "predict" and config.delta_unit == "quantile":
         state = state.replace(delta=_measure_delta(config, dataset, state, key_delta))
     windows = _draw(config, dataset, key_windows, jnp.zeros((), jnp.int32), dataset.count)
-    noise = [jax.random.normal(key_option, (config.batch_size, config.size))]
+    noise, model = draw_noise(config, windows, key_option), as_model(state, dataset)
+    state, losses = descend(total_loss, config, model, state.replace(key=key), windows, *noise)
+    return state, losses | ({"delta": state.delta} if config.termination == "predict" else {})
+
+
+def draw_noise(config: OptionsConfig, windows: Window, key: Key[Array, ""]) -> list[Array]:
+    """Return the noise of `total_loss`: [N, D] for codes and, for a closed-loop D, [N, L, P] on states."""
+    noise = [jax.random.normal(key, (len(windows.mask), config.size))]
     if config.decoder == "closed":
-        key_states = jax.random.fold_in(key_option, 1)  # separate, so that an open-loop decoder draws the same
+        key_states = jax.random.fold_in(key, 1)  # separate, so that an open-loop decoder draws the same
         noise.append(config.state_noise * jax.random.normal(key_states, windows.states[:, :-1].shape))
-    model = as_model(state, dataset)
-    gradient, losses = jax.grad(total_loss, has_aux=True)(state.params, model, config, windows, *noise)
+    return noise
+
+
+def descend(
+    loss: LossFn, config: OptionsConfig, model: OptionModel, state: LearnState, windows: Window, *args: Array
+) -> tuple[LearnState, dict[str, Array]]:
+    """Take one gradient step on the loss of N windows; return the next state, the terms and the code `nonfinite`.
+
+    Scales and delta are those of `model`, parameters those of `state`; `args` go to the loss after the windows.
+    """
+    gradient, losses = jax.grad(loss, has_aux=True)(state.params, model, config, windows, *args)
     with jax.numpy_dtype_promotion("standard"):  # Optax raises a float to an integer power
         updates, optimizer = make_optimizer(config).update(gradient, state.optimizer)
     params: Any = optax.apply_updates(state.params, updates)
     nonfinite = first_nonfinite(
         window=(windows.states, windows.actions), loss=list(losses.values()), gradient=(params, optimizer)
     )
-    losses = losses | {"nonfinite": nonfinite} | ({"delta": state.delta} if config.termination == "predict" else {})
-    return state.replace(params=params, optimizer=optimizer, key=key, step=state.step + 1), losses
+    state = state.replace(params=params, optimizer=optimizer, step=state.step + 1)
+    return state, losses | {"nonfinite": nonfinite}
 
 
 def _draw(
