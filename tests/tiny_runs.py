@@ -11,17 +11,30 @@ import numpy as np
 import pytest
 
 from taic_jax import trainer
-from taic_jax.config import CollectConfig, Config, EvaluateConfig, OptionsConfig, PPOConfig, SACConfig, TrainConfig
+from taic_jax.config import (
+    CollectConfig,
+    Config,
+    DQNConfig,
+    EvaluateConfig,
+    OptionsConfig,
+    PPOConfig,
+    SACConfig,
+    TrainConfig,
+)
 from taic_jax.runtime import driver
 from taic_jax.runtime.checkpoint import Checkpoints, load_arrays
 from taic_jax.runtime.run_folder import RunFolder
 
 PPO = PPOConfig(num_envs=2, rollout_length=8, epochs=1, minibatch_size=16, hidden_sizes=(4,))
-SAC = SACConfig(num_envs=2, rollout_length=8, update_every=4, warmup=16, capacity=20, batch_size=4, hidden_sizes=(4,))
+REPLAY = {
+    "num_envs": 2, "rollout_length": 8, "update_every": 4, "warmup": 16, "capacity": 20, "batch_size": 4,
+    "hidden_sizes": (4,),
+}  # fmt: skip
+SAC, DQN = SACConfig(**REPLAY), DQNConfig(**REPLAY)
 CONFIG = Config(
-    collect=CollectConfig(ticks=3 * 16, capacity=2 * 16, ppo=PPO, sac=SAC),
+    collect=CollectConfig(ticks=3 * 16, capacity=2 * 16, ppo=PPO, sac=SAC, dqn=DQN),
     options=OptionsConfig(length=2, size=2, hidden_size=4, mlp_sizes=(4,), steps=4, batch_size=8),
-    train=TrainConfig(ticks=3 * 16, ppo=PPO, sac=SAC),
+    train=TrainConfig(ticks=3 * 16, ppo=PPO, sac=SAC, dqn=DQN),
     evaluate=EvaluateConfig(episodes=2, video_ticks=3),
     seeds=2,
 )

@@ -21,7 +21,7 @@ from taic_jax.runtime.checkpoint import ArtifactError
 from taic_jax.runtime.driver import Run
 
 RULES = ("fixed", "output", "predict")
-KINDS = [(rule, "ppo") for rule in RULES] + [("fixed", "sac")]
+KINDS = [(rule, "ppo") for rule in RULES] + [("fixed", "sac"), ("output", "dqn")]
 
 
 @pytest.fixture(scope="module", params=KINDS, ids="-".join)
@@ -33,6 +33,8 @@ def run(request, tmp_path_factory) -> tuple[Path, Result]:
         options__delta=0.44, options__delta_unit="error", evaluate__video_ticks=0, train__baselines=("flat", "repeat"),
         train__ppo__hidden_sizes=(3,), train__sac__hidden_sizes=(3,),
     )  # fmt: skip
+    if learner == "dqn":
+        config = with_fields(config, env__name="four_rooms", options__codes=3, options__sample_actions=True)
     folder = tmp_path_factory.mktemp("run") / "run"
     return folder, taic.run_pipeline(config, folder, quiet=True)
 
