@@ -27,6 +27,24 @@ def mlp(network, *values):
     return value
 
 
+def values(value):
+    """Return the values of DQN, by layers with rectifiers, and perhaps layer norms, between them."""
+    names = about["layers"]["values"]
+    first, *layers = (name for name in names if f"{name}.kernel" in x)
+    value = dense(first, value)
+    for i, layer in enumerate(layers):
+        if norms := [name for name in names if name.endswith(f"LayerNorm_{i}")]:
+            value = (value - value.mean()) / np.sqrt(value.var() + 1e-6)
+            value = value * x[f"{norms[0]}.scale"] + x[f"{norms[0]}.bias"]
+        value = dense(layer, np.maximum(value, 0))
+    return value
+
+
+def one_hot(scores):
+    """Return 1 at the greatest of the scores and 0 elsewhere."""
+    return np.eye(len(scores))[np.argmax(scores)]
+
+
 def lstm(cell, carry, value):
     """Return the next carry of an LSTM, memory and output."""
     i, f, g, o = (value @ x[f"{cell}.i{gate}.kernel"] + dense(f"{cell}.h{gate}", carry[1]) for gate in "ifgo")
@@ -50,7 +68,11 @@ def ended():
     return about["termination"] == "output" and logit > 0
 
 
-env = gymnasium.wrappers.RescaleAction(gymnasium.make(name), *about["actions"])
+env = gymnasium.make(name)
+if about["discrete"]:  # the action is one-hot
+    env = gymnasium.wrappers.TransformAction(env, np.argmax, None)
+else:
+    env = gymnasium.wrappers.RescaleAction(env, *about["actions"])
 for seed in range(10):
     obs, _ = env.reset(seed=seed)
     duration, total, done = 0, 0.0, False
@@ -58,9 +80,12 @@ for seed in range(10):
         state = obs[: about["proprioceptive_size"]]
         if duration in (0, about["length"]) or ended():
             seen = np.clip(scaled("obs_statistics", obs), -about["clip"], about["clip"])
-            option, duration, first = mlp("actor", seen), 0, state
+            option = values(seen) if about["layers"]["values"] else mlp("actor", seen)
+            duration, first = 0, state
             if about["bound"]:  # of SAC: the mean is squashed, and the other half of the outputs is its deviation
                 option = about["bound"] * np.tanh(np.split(option, 2)[0])
+            if about["one_hot"]:
+                option = one_hot(option) @ x.get("executor.model.book", np.eye(len(option)))
             if about["decoder"] == "open":
                 carry = np.split(np.tanh(dense(D + "first", option)), 2)
             if about["termination"] == "predict":
@@ -72,7 +97,7 @@ for seed in range(10):
         elif about["decoder"] == "closed":
             share = [duration / about["length"]]
             *action, logit = mlp("decoder", scaled("executor.model.state_scale", state), option, share)
-        action = np.clip(action, -1, 1).astype(np.float32)
+        action = one_hot(action) if about["discrete"] else np.clip(action, -1, 1).astype(np.float32)
         if about["termination"] == "predict":
             read = lstm(E + "cell", read, action)
         duration += 1

@@ -11,7 +11,11 @@ import numpy as np
 folder, name = [*sys.argv[1:], "HalfCheetah-v5"][:2]
 about = json.loads(Path(folder, "agent.json").read_text())
 tick = jax.jit(jax.export.deserialize(bytearray(Path(folder, "agent.stablehlo").read_bytes())).call)
-env = gymnasium.wrappers.RescaleAction(gymnasium.make(name), *about["actions"])
+env = gymnasium.make(name)
+if about["discrete"]:  # the action is one-hot
+    env = gymnasium.wrappers.TransformAction(env, np.argmax, None)
+else:
+    env = gymnasium.wrappers.RescaleAction(env, *about["actions"])
 for seed in range(10):
     obs, _ = env.reset(seed=seed)
     carry = [np.full(x["shape"], x["start"], x["dtype"]) for x in about["carry"]]

@@ -70,18 +70,40 @@ class _Graph:
         return [*map(name, jaxpr.outvars)]
 
     def node(self, equation: Any, inputs: list[str]) -> list[str]:
-        params = equation.params
-        match equation.primitive.name:
+        params, kind = equation.params, equation.primitive.name
+        if kind in OPERATORS:
+            operator, further, attributes = OPERATORS[kind]
+            inputs = [*inputs, *(self.constant(params[x]) for x in further)]
+            attributes = {x: params[y] for x, y in attributes.items()}
+            return self.add(operator, inputs, len(equation.outvars), **attributes)
+        match kind:
             case "jit" | "pjit":
                 return self.inline(params["jaxpr"], inputs)
+            case "custom_jvp_call":
+                return self.inline(params["call_jaxpr"], inputs)
             case "square":
                 return self.add("Mul", inputs * 2)
+            case "rsqrt":
+                return self.add("Reciprocal", self.add("Sqrt", inputs))
             case "select_n":
                 return self.add("Where", [inputs[0], inputs[2], inputs[1]])
             case "convert_element_type":
                 return self.add("Cast", inputs, to=helper.np_dtype_to_tensor_dtype(params["new_dtype"]))
+            case "dot_general" if params["dimension_numbers"][0] == ((equation.invars[0].aval.ndim - 1,), (0,)):
+                return self.add("MatMul", inputs)
+        return self.along_axes(equation, inputs)
+
+    def along_axes(self, equation: Any, inputs: list[str]) -> list[str]:
+        """Add an equation whose parameters are axes and shapes."""
+        params = equation.params
+        match equation.primitive.name:
             case "reduce_sum":
                 return self.add("ReduceSum", [*inputs, self.constant(params["axes"])], keepdims=0)
+            case "argmax":
+                place = self.add("ArgMax", inputs, axis=params["axes"][0], keepdims=0)
+                return self.add("Cast", place, to=helper.np_dtype_to_tensor_dtype(params["index_dtype"]))
+            case "iota" if len(params["shape"]) == 1:
+                return [self.constant(np.arange(*params["shape"]), params["dtype"])]
             case "stack":
                 rows = [self.add("Unsqueeze", [x, self.constant([params["axis"]])])[0] for x in inputs]
                 return self.add("Concat", rows, axis=params["axis"])
@@ -89,12 +111,4 @@ class _Graph:
                 new = [i for i in range(len(params["shape"])) if i not in params["broadcast_dimensions"]]
                 rows = self.add("Unsqueeze", [*inputs, self.constant(new)])
                 return self.add("Expand", [*rows, self.constant(params["shape"])])
-            case "dot_general" if params["dimension_numbers"][0] == ((equation.invars[0].aval.ndim - 1,), (0,)):
-                return self.add("MatMul", inputs)
-            case kind if kind in OPERATORS:
-                operator, further, attributes = OPERATORS[kind]
-                inputs = [*inputs, *(self.constant(params[x]) for x in further)]
-                return self.add(
-                    operator, inputs, len(equation.outvars), **{x: params[y] for x, y in attributes.items()}
-                )
         raise NotImplementedError(f"expected a primitive with a node in {__name__}, got {equation}")

@@ -69,4 +69,5 @@ def export(agent: Agent, formats: Sequence[str]) -> tuple[dict[str, bytes], dict
     ordered = {x: sorted(names, key=lambda name: (len(name), name)) for x, names in layers.items()}
     about = {"observation_size": agent.observation_size, "actions": [-1, 1], "carry": carry, "layers": ordered}
     bound = float(agent.params.bound) if isinstance(agent.params, SquashedParams) else None
-    return files, {**about, "activation": "tanh", "clip": CLIP, "bound": bound, "length": agent.executor.length}
+    about |= {"activation": "tanh", "clip": CLIP, "bound": bound, "length": agent.executor.length}
+    return files, about | {"one_hot": agent.executor.discrete}

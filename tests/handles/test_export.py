@@ -19,17 +19,19 @@ import taic_jax as taic
 from taic_jax.__main__ import main
 from taic_jax.artifacts.agents import save_agents
 from taic_jax.artifacts.models import empty_model, save_options
-from taic_jax.networks import Policy, SquashedPolicy
+from taic_jax.networks import GreedyPolicy, Policy, SquashedPolicy
 from taic_jax.options.execution import IdentityExecutor, make_executor
 from taic_jax.rl import normalize
 from taic_jax.rl.agent import Agent
 
 EXAMPLES = Path(__file__).parents[2] / "experiments" / "examples"
-ENV = f"{EXAMPLES / 'pendulum.py'}:Pendulum"
+ENV, CART_POLE = f"{EXAMPLES / 'pendulum.py'}:Pendulum", f"{Path(__file__).parents[1] / 'cart_pole.py'}:CartPole"
 EPISODES, TICKS, LENGTH = 10, 24, 4
 KINDS = [(decoder, rule) for decoder in ("open", "closed") for rule in ("fixed", "output", "predict")] + [
     ("", ""),
     ("", "sac"),
+    ("", "dqn"),
+    ("open", "dqn"),
 ]
 RUNNERS = {"jax": "run_stablehlo.py", "onnx": "run_onnx.py", "npz": "run_npz.py"}
 pytest.importorskip("onnx")
@@ -39,11 +41,11 @@ pytest.importorskip("onnxruntime")
 class Replay(gymnasium.Env):
     """Show recorded observations, whatever the actions, and keep these."""
 
-    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (3,), np.float32)
     action_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
 
-    def __init__(self) -> None:
-        self.obs = np.random.default_rng(0).normal(size=(EPISODES, TICKS + 1, 3)).astype(np.float32)
+    def __init__(self, size: int) -> None:
+        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float32)
+        self.obs = np.random.default_rng(0).normal(size=(EPISODES, TICKS + 1, size)).astype(np.float32)
         self.actions = np.full((EPISODES, TICKS, 1), np.nan)
 
     def reset(self, *, seed=None, options=None):
@@ -65,16 +67,24 @@ def scattered(tree, rng):
 
 def agents_of(env, config, decoder: str, learner: str) -> Agent:
     """Return two untrained agents [2] whose actions and ends of options depend on the observation."""
-    rng, executor = np.random.default_rng(2), IdentityExecutor(1)
+    rng, executor = (
+        np.random.default_rng(0 if env.discrete else 2),
+        IdentityExecutor(env.action_size, discrete=env.discrete),
+    )
+    size = env.observation_size
     if decoder:
         model = scattered(empty_model(env, config.options), rng)
         scales = [x.replace(std=0.5 + x.std**2) for x in (model.state_scale, model.change_scale)]
         model = model.replace(state_scale=scales[0], change_scale=scales[1], delta=jnp.full(2, 4.0))
         executor = make_executor(config.options, model)
+        executor = executor if executor.std is None else executor.replace(std=jnp.ones(2))
     policy = (SquashedPolicy if learner == "sac" else Policy)(executor.option_size, (4,))
-    statistics = jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * 2), normalize.init((3,)))
-    statistics = statistics.replace(mean=jnp.full((2, 3), 0.5), std=jnp.array([[1.0, 0.5, 0.05]] * 2))  # clips
-    params = scattered(policy.init(jax.random.key(0), 3, 0.0), rng)
+    if learner == "dqn":
+        policy = GreedyPolicy(executor.option_size, (4, 4), layer_norm=True)
+    statistics = jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * 2), normalize.init((size,)))
+    std = jnp.array([[1.0, 0.5, 0.05, 1.0][:size]] * 2)  # clips
+    statistics = statistics.replace(mean=jnp.full((2, size), 0.5), std=std)
+    params = scattered(policy.init(jax.random.key(0), size, 0.0), rng)
     if learner == "sac":
         params = params.replace(bound=np.array([1.0, 0.75], np.float32))
     return Agent(executor, params, statistics, policy)
@@ -84,11 +94,15 @@ def agents_of(env, config, decoder: str, learner: str) -> Agent:
 def source(request, tmp_path_factory) -> tuple[Path, str]:
     """Return saved agents of each kind, and the name of their method."""
     decoder, rule = request.param
-    learner, rule = ("sac", "") if rule == "sac" else ("ppo", rule)
+    learner, rule = (rule, "") if rule in ("sac", "dqn") else ("ppo", rule)
     fields = {"length": LENGTH, "decoder": decoder or "open", "termination": rule or "fixed"}
+    name = ENV
+    if learner == "dqn":  # an export takes the most probable actions
+        fields, name = fields | {"codes": 3, "sample_actions": True}, CART_POLE
     fields = {f"options__{name}": value for name, value in fields.items()}
-    config = with_fields(CONFIG, env__name=ENV, collect__learner=learner, **fields)
-    env, method = taic.make_env(ENV), "taic" if decoder else "flat"
+    config = with_fields(CONFIG, env__name=name, collect__learner=learner, train__learner=learner, **fields)
+    config = with_fields(config, collect__dqn__hidden_sizes=(4, 4), train__dqn__hidden_sizes=(4, 4))
+    env, method = taic.make_env(name), "taic" if decoder else "flat"
     folder = tmp_path_factory.mktemp("agents") / method
     save_agents(folder, agents_of(env, config, decoder, learner), env, config, method)
     return folder, method
@@ -109,17 +123,19 @@ def test_every_file_acts_as_the_agent_by_the_program_that_the_guide_gives(source
     assert capsys.readouterr().out.splitlines() == [str(out / name) for name in names]
     about = json.loads((out / "agent.json").read_text())
     assert about["crc32"] == {name: zlib.crc32((out / name).read_bytes()) for name in names[:3]}
-    assert (about["method"], about["seed"], about["dt"]) == (source[1], 1, 0.05)
-    agent, env = taic.load(source[0]).agents[source[1]][1], Replay()
+    handle = taic.load(source[0])
+    assert (about["method"], about["seed"], about["dt"]) == (source[1], 1, handle.env.dt)
+    agent, env = handle.agents[source[1]][1], Replay(handle.env.observation_size)
     expected, durations = np.empty_like(env.actions), []
     for episode in range(EPISODES):
         carry = agent.start(env.obs[episode, 0])
         for t in range(TICKS):
-            carry, expected[episode, t], tick = agent.act(carry, env.obs[episode, t])
+            carry, action, tick = agent.act(carry, env.obs[episode, t])
+            expected[episode, t] = np.argmax(action) if about["discrete"] else action
             durations.append(int(tick.duration))
     early = sum(new == 1 and LENGTH > old > 1 for old, new in pairwise(durations))
     assert (early > 0) == (about["termination"] in ("output", "predict"))
-    assert np.std(expected) > 0.2 and np.mean(np.abs(expected) < 1) > 0.15
+    assert np.std(expected) > 0.2 and np.mean(np.abs(expected) < 1) > 0.15  # discrete ones are 0 or 1
     for kind, runner in RUNNERS.items():
         env.actions[:] = np.nan
         monkeypatch.setattr(gymnasium, "make", lambda name: env)

@@ -42,7 +42,7 @@ def run(request, tmp_path_factory) -> tuple[Path, Result]:
 def test_a_run_is_loaded_with_all_its_agents_as_they_were_returned(run):
     folder, result = run
     handle = taic.load(folder)
-    assert set(handle.agents) == {"taic", "flat", "repeat", "collect"} and handle.env.name == "nav2d"
+    assert set(handle.agents) == {"taic", "flat", "repeat", "collect"} and handle.env.name == handle.config.env.name
     assert len(handle.options) == len(handle.agents["flat"]) == 2
     for name, agents in result.agents.items():
         assert_trees_equal(handle.agents[name].rows, agents.rows)
@@ -90,7 +90,7 @@ def test_an_agent_may_be_compiled_and_batched_and_called_with_numpy(run):
 def test_options_alone_are_loaded_with_their_structure(run):
     folder = run[0]
     handle = taic.load(folder / "options")
-    assert handle.agents == {} and handle.config.options.length == 4 and handle.env.name == "nav2d"
+    assert handle.agents == {} and handle.config.options.length == 4 and handle.env.name == handle.config.env.name
     assert_trees_equal(handle.options.rows, taic.load(folder).options.rows.replace(delta=handle.options.rows.delta))
 
 
@@ -98,11 +98,11 @@ def test_the_video_is_of_the_first_seed(run, tmp_path, monkeypatch):
     """What is recorded here is a layer of the policy, and what is drawn is nothing."""
     handle, seen = taic.load(run[0]), []
     env, agents = handle.env, handle.agents["taic"].rows
-    monkeypatch.setattr(summary, "record", lambda env, agent, key, ticks: agent.params.actor)
+    monkeypatch.setattr(summary, "record", lambda env, agent, key, ticks: agent.params)
     monkeypatch.setattr(type(env), "render", lambda env, drawn: seen.append(drawn) or np.zeros((3, 8, 6, 3), np.uint8))
     with Run.view(CONFIG, tmp_path, CONFIG) as view:
         summary.write_video(view, env, agents)
-    assert_trees_equal(seen[0], jax.tree.map(lambda x: x[0], agents.params.actor))
+    assert_trees_equal(seen[0], jax.tree.map(lambda x: x[0], agents.params))
     assert (tmp_path / "video.webp").is_file()
 
 
