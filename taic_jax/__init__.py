@@ -26,7 +26,7 @@ if TYPE_CHECKING:
         TrainConfig,
     )
     from taic_jax.config.files import load_config
-    from taic_jax.config.learners import PPOConfig, SACConfig
+    from taic_jax.config.learners import DQNConfig, PPOConfig, SACConfig
     from taic_jax.envs import AutoReset, Env, State, environment_names, make_env
     from taic_jax.envs.adapters import to_gymnasium
     from taic_jax.handles.load import Handle, load
@@ -43,7 +43,7 @@ _MODULES = {
     "analysis.measures": "measure_option_space",
     "analysis.statistics": "bootstrap_interval iqm",
     "config": "CollectConfig Config EnvConfig EvaluateConfig FineTuneConfig OptionsConfig TrainConfig",
-    "config.learners": "PPOConfig SACConfig",
+    "config.learners": "DQNConfig PPOConfig SACConfig",
     "config.files": "load_config",
     "envs": "AutoReset Env State environment_names make_env",
     "envs.adapters": "to_gymnasium",
