@@ -128,6 +128,10 @@ REFUSED = {
         "train.sac.update_every: expected a divisor of train.sac.rollout_length = 8, got 3; "
         "the nearest valid value is 2",
     ),
+    "a buffer smaller than a round": (
+        {"train__sac__capacity": 7},
+        "train.sac.capacity: expected the decisions of a round, train.sac.num_envs * train.sac.update_every = 8, got 7",
+    ),
     "a round longer than an iteration": (
         {"collect__sac__update_every": 9},
         "collect.sac.update_every: expected at most collect.sac.rollout_length = 8, got 9",

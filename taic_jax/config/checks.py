@@ -55,9 +55,9 @@ def _check_learners(config: Config) -> None:
             raise impossible(name, learner, needed, "ppo")
     for stage, group in (("collect", config.collect), ("train", train)):
         for name, learner in ((f"{stage}.sac", group.sac), (f"{stage}.dqn", group.dqn)):
-            if learner.capacity < learner.num_envs:
-                expected = f"a transition for each of {name}.num_envs = {learner.num_envs}"
-                raise impossible(f"{name}.capacity", learner.capacity, expected, learner.num_envs)
+            if learner.capacity < (fewest := learner.num_envs * learner.update_every):
+                expected = f"the decisions of a round, {name}.num_envs * {name}.update_every = {fewest}"
+                raise impossible(f"{name}.capacity", learner.capacity, expected, fewest)
             if learner.rollout_length % learner.update_every:
                 rounds = range(1, learner.update_every + 1)
                 valid = max(n for n in rounds if learner.rollout_length % n == 0)
