@@ -3,6 +3,7 @@
 import dataclasses
 from functools import partial
 
+import distrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,7 +14,7 @@ from scipy import special, stats
 import taic_jax as taic
 from taic_jax.config import DQNConfig, PPOConfig
 from taic_jax.envs import Env, State, TimeLimit
-from taic_jax.networks import CategoricalPolicy, GreedyPolicy, gumbel
+from taic_jax.networks import CategoricalPolicy, GreedyPolicy, Policy, gumbel
 from taic_jax.options.execution import IdentityExecutor
 from taic_jax.rl import dqn
 from taic_jax.rl.replay import Transition
@@ -100,6 +101,13 @@ def test_gumbel_numbers_are_gumbel_even_far_from_the_middle():
     assert stats.kstest(gumbel(noise), stats.gumbel_r.cdf).pvalue > 0.01
     far = jnp.array([-9.0, 9.0])
     np.testing.assert_allclose(gumbel(far), -np.log(-special.log_ndtr(np.asarray(far, float))), rtol=1e-5)
+
+
+def test_the_divergence_of_a_gaussian_policy_is_from_the_standard_normal():
+    policy = Policy(2, (4,))
+    normal = distrax.MultivariateNormalDiag(jnp.array([1.0, -2.0]), jnp.array([0.5, 2.0]))
+    expected = sum((s**2 + m**2 - 1) / 2 - np.log(s) for m, s in ((1.0, 0.5), (-2.0, 2.0)))
+    np.testing.assert_allclose(policy.divergence(normal), expected, rtol=1e-5)
 
 
 @pytest.mark.parametrize("prior_weight", [0.0, 0.3])

@@ -95,6 +95,18 @@ def test_targets_follow_the_critics_and_the_step_is_adams_first(learnt):
     assert after.policy.bound == 3.0
 
 
+def test_the_prior_weight_takes_the_place_of_the_temperature(learnt):
+    config, policy, _, learnt, batch, noise = learnt
+    option, log_prob = policy.draw(learnt.policy, batch.obs, 1.0, noise[1])
+    np.testing.assert_allclose(sac.cost(config, 3.0, 0.5, option, log_prob), 0.5 * log_prob, rtol=1e-5)
+    near = as_arrays(dataclasses.replace(config, prior_weight=0.2))
+    prior = stats.norm.logpdf(np.asarray(option, float)).sum(axis=1)
+    density = np.asarray(log_prob, float) - D * np.log(3)  # of the option itself
+    np.testing.assert_allclose(
+        sac.cost(near, 3.0, 0.5, option, log_prob), 0.2 * (density - prior), rtol=1e-3, atol=1e-4
+    )
+
+
 def train(env, executor, ticks: int, **changes):
     config = dataclasses.replace(CONFIG, **changes)
     run = jax.jit(partial(taic.train, config, env, executor, ticks=ticks))
