@@ -129,7 +129,7 @@ def _round(
     pending, transitions = complete(state.pending, ticks, config.gamma, goals)
     replay = add(state.replay, transitions, ticks.ended)
     owed = state.owed + jnp.where(warm, config.updates_per_decision * jnp.sum(ticks.ended, dtype=jnp.float32), 0.0)
-    statistics = normalize.update(state.obs_statistics, ticks.obs)
+    statistics = normalize.update(state.obs_statistics, with_achieved_goals(ticks, goals))
     state = state.replace(obs_statistics=statistics, replay=replay, pending=pending, running=running)
     learnt, terms = improve(rule, config, goals, executor, state, jnp.floor(owed), key_update)
     code = first_nonfinite(
@@ -137,6 +137,17 @@ def _round(
         reward=ticks.reward, loss=terms, gradient=learnt,
     )  # fmt: skip
     return state.replace(learnt=learnt, owed=owed - jnp.floor(owed)), (ticks, terms, code)
+
+
+def with_achieved_goals(ticks: Rollout, goals: Goals | None) -> Float[Array, "N B S"]:
+    """Return the observations of ticks [T, B]; for hindsight N is 2 T, and the second half aims at goals achieved.
+
+    Statistics of a goal that is always the same would take every other one for an outlier, and clip it.
+    """
+    if goals is None:
+        return ticks.obs
+    aimed = jax.vmap(jax.vmap(lambda obs, after: goals.aim(obs, goals.achieved(after))))(ticks.obs, ticks.final_obs)
+    return jnp.concatenate([ticks.obs, aimed])
 
 
 def collect(

@@ -9,7 +9,8 @@ import pytest
 from PIL import ImageColor
 
 from taic_jax.envs import Navigation, RenderingError, make_env, rendering
-from taic_jax.envs.navigation import _GOAL, _POINT, _WALL, NavigationState
+from taic_jax.envs.navigation import NavigationState
+from taic_jax.envs.plans import _PATH, _WALL
 
 
 def near(frame, colour: str):
@@ -29,11 +30,11 @@ def test_room_shows_point_walls_and_path():
 
     for t in range(4):
         assert near(frames[t], _WALL)[pixel(5.0, 2.0)] and near(frames[t], _WALL)[pixel(2.5, 3.0)]
-        assert near(frames[t], _POINT)[pixel(*position[t].tolist())]
+        assert near(frames[t], _PATH)[pixel(*position[t].tolist())]
         assert near(frames[t], _WALL)[pixel(7.2, 4.0)] == (t == 3), "the trap stands from the second episode on"
-    red = near(frames, _POINT).sum(axis=(1, 2))
+    red = near(frames, _PATH).sum(axis=(1, 2))
     assert red[0] < red[2] and red[3] <= red[0] + 2, "the path grows, and starts anew after a reset"
-    assert not near(frames[0], _GOAL)[pixel(9.0, 5.7)]
+    assert not near(frames[0], "#3a9d5d")[pixel(9.0, 5.7)]
     assert frames[0][pixel(9.0, 5.0)][1] > frames[0][pixel(9.0, 5.0)][0] + 30, "the goal is green"
 
 

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from point_maze import PointMaze
 from probes import Constant, Counting, Observed, OneOf, Repeat, Sign, TwoStep, draw
 from scipy import stats
 
@@ -138,6 +139,16 @@ def test_options_are_uniform_before_the_warm_up_is_over():
     _, _, ticks = step(state)
     drawn = np.asarray(ticks.option)[np.asarray(ticks.decision)]
     assert stats.kstest(drawn[:, 0], stats.uniform(-3, 6).cdf).pvalue < 1e-6
+
+
+@pytest.mark.parametrize("relabel", [0, 4])
+def test_statistics_see_the_goals_of_hindsight(relabel):
+    config, env, executor = as_arrays(dataclasses.replace(CONFIG, relabel=relabel)), PointMaze(), Repeat(3, 2)
+    state = sac.init(config, env, executor, jax.random.key(0))
+    state, _, ticks = jax.jit(partial(sac.iterate, config, env, executor, 5))(state)
+    goals = [ticks.obs[..., 2:], ticks.final_obs[..., :2]] if relabel else [ticks.obs[..., 2:]]
+    np.testing.assert_allclose(state.obs_statistics.mean[2:], np.mean(goals, axis=(0, 1, 2)), atol=1e-5)
+    np.testing.assert_allclose(state.obs_statistics.std[2:], np.std(goals, axis=(0, 1, 2)), rtol=1e-3, atol=1e-5)
 
 
 def test_values_of_tasks_whose_answer_is_known():
