@@ -17,7 +17,7 @@ if sys.platform == "linux" and "DISPLAY" not in os.environ and ctypes.util.find_
     os.environ.setdefault("MUJOCO_GL", "egl")
 
 from taic_jax.envs.adapters import BRAX_PREFIX, GYMNAX_PREFIX, PLAYGROUND_PREFIX, BraxEnv, GymnaxEnv, PlaygroundEnv
-from taic_jax.envs.ant_tasks import AntArena, AntTurn
+from taic_jax.envs.ant_tasks import AntArena, AntHeadings, AntTurn
 from taic_jax.envs.arenas import FALL, MAZE, PUSH
 from taic_jax.envs.base import Env, PhysicsState, State
 from taic_jax.envs.contract import check_contract
@@ -27,11 +27,11 @@ from taic_jax.envs.grid import FourRooms
 from taic_jax.envs.locomotion import Locomotion
 from taic_jax.envs.navigation import Navigation
 from taic_jax.envs.physics import BACKENDS
-from taic_jax.envs.robots import ROBOTS, with_body
+from taic_jax.envs.robots import ROBOTS, with_body, with_contacts
 from taic_jax.envs.wrappers import AutoReset, TimeLimit, Wrapper
 
 __all__ = [
-    "AntArena", "AntTurn", "AutoReset", "BraxEnv", "ContractError", "Env", "EnvOptionError", "FourRooms", "GymnaxEnv",
+    "AntArena", "AntHeadings", "AntTurn", "AutoReset", "BraxEnv", "ContractError", "Env", "EnvOptionError", "FourRooms", "GymnaxEnv",
     "Locomotion", "MissingExtraError", "Navigation", "PhysicsState", "PlaygroundEnv", "RenderingError", "State",
     "TimeLimit", "UnknownNameError", "Wrapper", "check_contract", "environment_names", "environment_options",
     "make_env",
@@ -46,10 +46,12 @@ class _Task(NamedTuple):
     has_engine: bool = True
 
 
-def _make_robot(name: str, model: str, backend: str, num_threads: int, body: str = "gym") -> Env:
+def _make_robot(
+    name: str, model: str, backend: str, num_threads: int, body: str = "gym", contacts: str = "feet"
+) -> Env:  # fmt: skip
     if model not in ROBOTS:
         raise UnknownNameError("model", model, ROBOTS)
-    return Locomotion(name, with_body(ROBOTS[model][name], body), backend, num_threads)
+    return Locomotion(name, with_contacts(with_body(ROBOTS[model][name], body), contacts), backend, num_threads)
 
 
 _TASKS = {
@@ -58,7 +60,8 @@ _TASKS = {
     "four_rooms": _Task(FourRooms, has_engine=False),
     "four_rooms_random": _Task(partial(FourRooms, random_ends=True), has_engine=False),
     **{name: _Task(partial(_make_robot, name), ("model",)) for name in ROBOTS["brax"]},
-    "ant": _Task(partial(_make_robot, "ant"), ("model", "body")),  # alone of the robots it has two bodies
+    "ant": _Task(partial(_make_robot, "ant"), ("model", "body", "contacts")),  # alone of the robots it has two bodies
+    "ant_headings": _Task(AntHeadings, ("body",)),
     "ant_turn": _Task(partial(AntTurn, "ant_turn", ROBOTS["brax"]["ant"])),
     "ant_maze": _Task(partial(AntArena, "ant_maze", MAZE), ("body", "goal")),
     "ant_push": _Task(partial(AntArena, "ant_push", PUSH), ("body",)),
@@ -84,7 +87,7 @@ def environment_options(name: str) -> tuple[str, ...]:
 
 def make_env(
     name: str, backend: str = "auto", *, num_threads: int = 0, pipeline: str = "spring", model: str = "brax",
-    body: str = "gym", goal: str = "fixed", change_after: int = 0,
+    body: str = "gym", contacts: str = "feet", goal: str = "fixed", change_after: int = 0,
 ) -> Env:  # fmt: skip
     """Make a task by name, with its time limit.
 
@@ -96,6 +99,7 @@ def make_env(
       pipeline: physics of `brax:NAME`: `spring`, `positional`, `generalized` or `mjx`.
       model: MJCF and rules of the running robots: `brax`, or `gym` for Gymnasium's own.
       body: of the ant, alone or in an arena: `gym`, or `hiro`, which is weaker and slower.
+      contacts: of `ant` with the ground: `feet`, or `body`, as in the arenas.
       goal: of the maze: `fixed`, `near`, or `uniform` while training.
       change_after: episodes after which the room of `nav2d` changes; 0 for never.
 
@@ -108,7 +112,7 @@ def make_env(
     task = _find(name)
     if backend not in BACKENDS:
         raise UnknownNameError("backend", backend, BACKENDS)
-    options = {"pipeline": pipeline, "model": model, "body": body, "goal": goal, "change_after": change_after}
+    options = {"pipeline": pipeline, "model": model, "body": body, "contacts": contacts, "goal": goal, "change_after": change_after}
     defaults = inspect.signature(make_env).parameters
     for option, value in options.items():
         if option not in task.options and value != defaults[option].default:

@@ -1,7 +1,8 @@
-"""Tasks for options learnt on the ant: to turn, and to reach a goal in a maze, behind a block or over a chasm."""
+"""Tasks of the ant: to go where it should, to turn, and to reach a goal in a maze, behind a block or over a chasm."""
 
 import copy
 import dataclasses
+import math
 
 import jax
 import jax.numpy as jnp
@@ -15,9 +16,10 @@ from taic_jax.envs.base import Goals, PhysicsState, State
 from taic_jax.envs.errors import UnknownNameError
 from taic_jax.envs.locomotion import Locomotion, Outcome
 from taic_jax.envs.rendering import render_mujoco
-from taic_jax.envs.robots import ROBOTS, compile_spec, initial_qpos, load_spec, with_body
+from taic_jax.envs.robots import ROBOTS, compile_spec, initial_qpos, load_spec, with_body, with_contacts
 
 SUCCESS_RADIUS = 5.0  # m, of HIRO
+HOLD = 60  # ticks of one direction of `AntHeadings`
 
 
 class TurningState(PhysicsState):
@@ -39,6 +41,66 @@ class AntTurn(Locomotion):
     def _progress(self, before: TurningState, after: TurningState) -> Outcome:
         rate = 2 * jnp.pi * (after.turns - before.turns) / self.dt
         return rate, {"yaw_rate": rate, "turns": after.turns}
+
+
+class HeadingsState(PhysicsState):
+    """The simulation, and the directions to go in one after another, each for `HOLD` ticks."""
+
+    directions: Array  # [N] rad in the world, left is positive
+    tick: Array  # [] int32; it starts at random, so that environments turn at different times
+
+
+class AntHeadings(Locomotion):
+    """Go in a direction that is drawn anew every three seconds, and do not fall: experience for options that steer.
+
+    The reward of a tick is the speed in m/s along the direction, less half the speed across it and the control cost,
+    plus the upward part of the torso's own axis: 1 if it is level. Only an ant on its back ends the episode.
+
+    Observation: the 27 entries of `ant`; then, seen from the ant's heading, the direction [2] and the torso's
+    horizontal velocity [2].
+    """
+
+    def __init__(self, body: str = "gym", backend: str = "auto", num_threads: int = 0):
+        ant = dataclasses.replace(ROBOTS["brax"]["ant"], control_cost=0.1)  # at 0.5 it hardly dares to walk
+        robot = with_contacts(with_body(ant, body), "body")
+        self._num_directions = math.ceil(robot.episode_length / HOLD) + 1
+        super().__init__("ant_headings", robot, backend, num_threads)
+        self.proprioceptive_size = ANT_QPOS - robot.num_unobserved + ANT_QVEL
+
+    def reset(self, key: Key[Array, ""]) -> State:
+        """Start with Gym's noise, and draw all directions of the episode."""
+        key_body, key_directions, key_tick = jax.random.split(key, 3)
+        state = super().reset(key_body)
+        directions = jax.random.uniform(key_directions, (self._num_directions,), minval=-jnp.pi, maxval=jnp.pi)
+        tick = jax.random.randint(key_tick, (), 0, HOLD)
+        physics = state.physics.replace(directions=directions, tick=tick)
+        return state.replace(physics=physics, obs=self._observe(physics))
+
+    def _begin(self, physics: PhysicsState) -> HeadingsState:
+        return HeadingsState(**vars(physics), directions=jnp.zeros(self._num_directions), tick=jnp.zeros((), jnp.int32))
+
+    def _advance(self, before: HeadingsState, after: HeadingsState) -> HeadingsState:
+        return after.replace(tick=before.tick + 1)
+
+    def _observe(self, physics: HeadingsState) -> Float[Array, " S"]:
+        angle, yaw = self._direction(physics), heading(physics.qpos[3:7])
+        seen = turned(jnp.stack([unit(angle), physics.qvel[:2]]), -yaw)
+        return jnp.concatenate([super()._observe(physics), *seen])
+
+    def _direction(self, physics: HeadingsState) -> Float[Array, ""]:
+        return physics.directions[physics.tick // HOLD]
+
+    def _is_healthy(self, physics: PhysicsState) -> Bool[Array, ""]:
+        return ~upside_down(physics.qpos[3:7])
+
+    def _judge(self, before: HeadingsState, after: HeadingsState, action: Float[Array, " A"]) -> Outcome:
+        velocity = (after.qpos[:2] - before.qpos[:2]) / self.dt
+        along, across = turned(velocity, -self._direction(before))
+        _, x, y, _ = after.qpos[3:7]
+        upright = 1 - 2 * (x**2 + y**2)
+        control_cost = self.robot.control_cost * jnp.sum(action**2)
+        reward = along - 0.5 * jnp.abs(across) + upright - control_cost
+        return reward, {"speed_along": along, "speed_across": jnp.abs(across), "upright": upright}
 
 
 class ArenaState(PhysicsState):
@@ -75,7 +137,7 @@ class AntArena(Locomotion):
         if goal == "near":
             arena = dataclasses.replace(arena, goal=arena.near_goal)
         self.arena, self.uniform_goal = arena, goal == "uniform"
-        robot = dataclasses.replace(with_body(ROBOTS["brax"]["ant"], body), iterations=4, ls_iterations=8)
+        robot = with_contacts(with_body(ROBOTS["brax"]["ant"], body), "body")
         super().__init__(name, robot, backend, num_threads)
         self.proprioceptive_size = ANT_QPOS - robot.num_unobserved + ANT_QVEL
 
@@ -178,6 +240,18 @@ def heading(quaternion: Float[Array, " 4"]) -> Float[Array, ""]:
     """Return the yaw in rad of the body's x axis, projected on the ground."""
     w, x, y, z = quaternion
     return jnp.arctan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2))
+
+
+def unit(angle: Float[Array, ""]) -> Float[Array, " 2"]:
+    """Return the vector of length 1 in this direction in rad."""
+    return jnp.stack([jnp.cos(angle), jnp.sin(angle)])
+
+
+def turned(vectors: Float[Array, "*batch 2"], angle: Float[Array, ""]) -> Float[Array, "*batch 2"]:
+    """Return horizontal vectors turned to the left by an angle in rad."""
+    c, s = unit(angle)
+    x, y = vectors[..., 0], vectors[..., 1]
+    return jnp.stack([c * x - s * y, s * x + c * y], axis=-1)
 
 
 def upside_down(quaternion: Float[Array, " 4"]) -> Bool[Array, ""]:

@@ -10,13 +10,15 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
+from taic_jax.envs.robots import ANT_BIT
+
 ANT_QPOS, ANT_QVEL = 15, 14  # the ant's share of qpos and qvel; a block's follows
 SOLID_HEIGHT = 4.0  # m
 TOLERANCE = 0.05  # m, by which a block may overrun its soft limits
 
 # Bits of contype and conaffinity for pairs that may collide. The ant collides with everything but itself, a block with
 # the solids that its arena names; elsewhere its joint limits stop it, and contacts would make it jam.
-_ANT, _BLOCK = 1, 2
+_BLOCK = 2
 _GEOM = mujoco.mjtGeom
 
 _GROUND, _BODY, _WALL = (0.5, 0.52, 0.5, 1), (0.95, 0.6, 0.1, 1), (0.55, 0.6, 0.68, 1)
@@ -77,21 +79,15 @@ FALL = Arena(
 
 
 def furnish(spec: mujoco.MjSpec, arena: Arena) -> None:
-    """Put the ant of `spec` into the arena; all its 13 body geoms collide with floor, walls, solids and block.
-
-    An ant whose fall ends no episode can lie on its back, where feet alone would let it sink into the floor. The floor
-    collides with the same shapes as in `ant`: its foot spheres are the ends of the ankles' capsules.
-    """
+    """Put the ant of `spec`, with the contacts of its body, into the arena."""
     for geom in spec.geoms:
         if geom.name == "floor":
-            geom.conaffinity, geom.material, geom.rgba = _ANT, "", _GROUND
+            geom.material, geom.rgba = "", _GROUND
         else:
-            is_foot = geom.type == _GEOM.mjGEOM_SPHERE and geom.name != "torso_geom"
-            geom.contype, geom.conaffinity = (0, 0) if is_foot else (_ANT, 0)
             geom.rgba = _BODY  # visible from above
     _add_walls(spec, arena)
     for i, (x_low, y_low, x_high, y_high) in enumerate(arena.solids):
-        meets = _ANT | (_BLOCK if arena.block and i in arena.block.meets else 0)
+        meets = ANT_BIT | (_BLOCK if arena.block and i in arena.block.meets else 0)
         pos = ((x_low + x_high) / 2, (y_low + y_high) / 2, SOLID_HEIGHT / 2)
         half = ((x_high - x_low) / 2, (y_high - y_low) / 2, SOLID_HEIGHT / 2)
         shape = {"type": _GEOM.mjGEOM_BOX, "pos": pos, "size": half, "rgba": _WALL}
@@ -127,7 +123,7 @@ def _add_walls(spec: mujoco.MjSpec, arena: Arena) -> None:
     for name, (place, inward) in sides.items():
         half_length = (y_high - y_low if inward[0] else x_high - x_low) / 2
         shape = {"type": _GEOM.mjGEOM_PLANE, "pos": (*place, height / 2), "size": (height / 2, half_length, 1)}
-        wall = spec.worldbody.add_geom(name=name, **shape, rgba=_WALL, contype=0, conaffinity=_ANT)
+        wall = spec.worldbody.add_geom(name=name, **shape, rgba=_WALL, contype=0, conaffinity=ANT_BIT)
         # A plane's normal is its z axis; its x axis, the first of its sizes in a picture, points up.
         wall.alt.type = mujoco.mjtOrientation.mjORIENTATION_XYAXES
         wall.alt.xyaxes = (0, 0, 1, inward[1], -inward[0], 0)
@@ -141,7 +137,7 @@ def _add_block(spec: mujoco.MjSpec, block: Block) -> None:
             limited=mujoco.mjtLimited.mjLIMITED_TRUE, range=slide.limits, damping=[slide.damping, 0, 0],
         )  # fmt: skip
     shape = {"type": _GEOM.mjGEOM_BOX, "size": block.half, "mass": block.mass, "rgba": _MOVABLE}
-    body.add_geom(name="block", **shape, contype=_BLOCK, conaffinity=_ANT)
+    body.add_geom(name="block", **shape, contype=_BLOCK, conaffinity=ANT_BIT)
 
 
 def _add_camera(spec: mujoco.MjSpec, arena: Arena) -> None:

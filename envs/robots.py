@@ -33,6 +33,7 @@ class Robot:
     velocity_limit: float = math.inf  # at which velocities are clipped in obs
     start_in_default_pose: bool = False  # and not in the model's numeric `init_qpos`
     episode_length: int = 1000  # ticks
+    contacts: str = "feet"  # of the ant with the ground: of its feet alone, or of the whole `body`
     proprioception: str = ""  # name of the slice of obs that its tasks share; empty for the task's
     # Settings of the engine; None for the model's own.
     timestep: float | None = None  # s
@@ -92,6 +93,8 @@ def _as_in_gym(robot: Robot, file: str) -> Robot:
 
 
 BODIES = ("gym", "hiro")  # Bodies of the ant, by the config's `env.body`.
+ANT_BIT = 1  # of contype and conaffinity
+CONTACTS = ("feet", "body")  # Geoms of the ant that touch the ground, by `env.contacts`.
 
 # Robots by the config's `env.model`. `gym` is Gymnasium's own MJCF, integrator and rules of version 5, without the
 # ant's contact forces, which MJX does not compute and which cost at most 42 an episode.
@@ -113,6 +116,18 @@ def with_body(ant: Robot, body: str) -> Robot:
     )  # fmt: skip
 
 
+def with_contacts(ant: Robot, contacts: str) -> Robot:
+    """Return the ant whose `feet` alone touch the ground, unchanged, or all 13 geoms of its `body`, as in the arenas.
+
+    Whoever lies on its back needs the body's: on feet alone it would sink into the floor.
+    """
+    if contacts not in CONTACTS:
+        raise UnknownNameError("contacts", contacts, CONTACTS)
+    if contacts == ant.contacts:
+        return ant
+    return dataclasses.replace(ant, contacts=contacts, iterations=4, ls_iterations=8)
+
+
 def load_spec(robot: Robot) -> mujoco.MjSpec:
     """Read the MJCF from the package that ships it, without its slow import, or raise `MissingExtraError`."""
     package, path = robot.mjcf
@@ -126,7 +141,22 @@ def load_spec(robot: Robot) -> mujoco.MjSpec:
         spec.option.integrator = robot.integrator
     for actuator in spec.actuators if robot.gear is not None else ():
         actuator.gear[0] = robot.gear
+    if robot.contacts == "body":
+        _touch_with_body(spec)
     return spec
+
+
+def _touch_with_body(spec: mujoco.MjSpec) -> None:
+    """Let the whole ant collide with whatever has `ANT_BIT` in its conaffinity, and with nothing of itself.
+
+    The floor collides with the same shapes as with feet alone: the foot spheres are the ends of the ankles' capsules.
+    """
+    for geom in spec.geoms:
+        if geom.name == "floor":
+            geom.conaffinity = ANT_BIT
+        else:
+            is_foot = geom.type == mujoco.mjtGeom.mjGEOM_SPHERE and geom.name != "torso_geom"
+            geom.contype, geom.conaffinity = (0, 0) if is_foot else (ANT_BIT, 0)
 
 
 def compile_spec(spec: mujoco.MjSpec) -> mujoco.MjModel:

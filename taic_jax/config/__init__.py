@@ -48,7 +48,9 @@ class EnvConfig:
     model: Literal["brax", "gym"] = "brax"
     """MJCF and rules of half_cheetah, ant, hopper and walker2d: Brax's, or Gymnasium's own."""
     body: Literal["gym", "hiro"] = "gym"
-    """Ant of ant, ant_maze, ant_push and ant_fall: Gym's, or HIRO's, which is weaker and acts half as often."""
+    """Ant of ant, ant_headings, ant_maze, ant_push and ant_fall: Gym's, or HIRO's, which is weaker and acts half as often."""
+    contacts: Literal["feet", "body"] = "feet"
+    """Contacts of ant with the ground: those of its feet alone, or of its whole body, as in the arenas."""
     goal: Literal["fixed", "near", "uniform"] = "fixed"
     """Goal of ant_maze: behind the walls, at the end of the first corridor, or random in each episode of training and
     behind the walls in evaluation."""
