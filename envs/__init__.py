@@ -31,10 +31,10 @@ from taic_jax.envs.robots import ROBOTS, with_body, with_contacts
 from taic_jax.envs.wrappers import AutoReset, TimeLimit, Wrapper
 
 __all__ = [
-    "AntArena", "AntHeadings", "AntTurn", "AutoReset", "BraxEnv", "ContractError", "Env", "EnvOptionError", "FourRooms", "GymnaxEnv",
-    "Locomotion", "MissingExtraError", "Navigation", "PhysicsState", "PlaygroundEnv", "RenderingError", "State",
-    "TimeLimit", "UnknownNameError", "Wrapper", "check_contract", "environment_names", "environment_options",
-    "make_env",
+    "AntArena", "AntHeadings", "AntTurn", "AutoReset", "BraxEnv", "ContractError", "Env", "EnvOptionError",
+    "FourRooms", "GymnaxEnv", "Locomotion", "MissingExtraError", "Navigation", "PhysicsState", "PlaygroundEnv",
+    "RenderingError", "State", "TimeLimit", "UnknownNameError", "Wrapper", "check_contract", "environment_names",
+    "environment_options", "make_env",
 ]  # fmt: skip
 
 
@@ -112,7 +112,14 @@ def make_env(
     task = _find(name)
     if backend not in BACKENDS:
         raise UnknownNameError("backend", backend, BACKENDS)
-    options = {"pipeline": pipeline, "model": model, "body": body, "contacts": contacts, "goal": goal, "change_after": change_after}
+    options = {
+        "pipeline": pipeline,
+        "model": model,
+        "body": body,
+        "contacts": contacts,
+        "goal": goal,
+        "change_after": change_after,
+    }
     defaults = inspect.signature(make_env).parameters
     for option, value in options.items():
         if option not in task.options and value != defaults[option].default:

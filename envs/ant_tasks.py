@@ -19,7 +19,8 @@ from taic_jax.envs.rendering import render_mujoco
 from taic_jax.envs.robots import ROBOTS, compile_spec, initial_qpos, load_spec, with_body, with_contacts
 
 SUCCESS_RADIUS = 5.0  # m, of HIRO
-HOLD = 60  # ticks of one direction of `AntHeadings`
+# Ticks of one direction of `AntHeadings`, and its greatest angle to the x axis in rad: the body's views cover the rest.
+HOLD, SPREAD = 60, math.pi / 4
 
 
 class TurningState(PhysicsState):
@@ -51,7 +52,7 @@ class HeadingsState(PhysicsState):
 
 
 class AntHeadings(Locomotion):
-    """Go in a direction that is drawn anew every three seconds, and do not fall: experience for options that steer.
+    """Go in a direction that is drawn anew every three seconds, within 45 degrees of the x axis, and do not fall: experience for options that steer.
 
     The reward of a tick is the speed in m/s along the direction, less half the speed across it and the control cost,
     plus the upward part of the torso's own axis: 1 if it is level. Only an ant on its back ends the episode.
@@ -71,7 +72,7 @@ class AntHeadings(Locomotion):
         """Start with Gym's noise, and draw all directions of the episode."""
         key_body, key_directions, key_tick = jax.random.split(key, 3)
         state = super().reset(key_body)
-        directions = jax.random.uniform(key_directions, (self._num_directions,), minval=-jnp.pi, maxval=jnp.pi)
+        directions = jax.random.uniform(key_directions, (self._num_directions,), minval=-SPREAD, maxval=SPREAD)
         tick = jax.random.randint(key_tick, (), 0, HOLD)
         physics = state.physics.replace(directions=directions, tick=tick)
         return state.replace(physics=physics, obs=self._observe(physics))

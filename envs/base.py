@@ -67,6 +67,14 @@ class Goals(NamedTuple):
     reward: Callable[[Array, Array], tuple[Array, Array]]  # (achieved [Q], goal [Q]) -> (reward, terminated) of a tick
 
 
+class Heading(NamedTuple):
+    """Indices in the proprioceptive slice of a body that can face anywhere, and the seconds of a tick."""
+
+    quaternion: int  # w, x, y, z of the root
+    velocity: int  # m/s along the world's x, then y
+    dt: float
+
+
 class Env(abc.ABC):
     """A task: unbatched and pure, so the caller applies `jax.vmap` and `jax.jit`.
 
@@ -86,6 +94,11 @@ class Env(abc.ABC):
     def views(self) -> Views:
         """Views of the body's motion: one, unless the body is symmetric."""
         return one_view(self.proprioceptive_size, self.action_size)
+
+    @property
+    def heading(self) -> Heading | None:
+        """Heading of the body, None if it has none."""
+        return None
 
     @property
     def evaluated(self) -> "Env":

@@ -9,7 +9,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, Key
 
-from taic_jax.envs.base import Env, PhysicsState, State
+from taic_jax.envs.base import Env, Heading, PhysicsState, State
 from taic_jax.envs.physics import make_physics
 from taic_jax.envs.rendering import render_mujoco
 from taic_jax.envs.robots import Robot, compile_spec, initial_qpos, load_spec
@@ -43,6 +43,14 @@ class Locomotion(Env):
         """Views of the robot from each of its equal sides."""
         robot = self.robot
         return make_views(robot.turned_obs, robot.turned_action, robot.sides) if robot.sides > 1 else super().views
+
+    @property
+    def heading(self) -> Heading | None:
+        """That of a robot whose root is free."""
+        if self.model.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE:
+            return None
+        hidden = self.robot.num_unobserved  # of the slice, which has one speed fewer than positions, hidden ones too
+        return Heading(3 - hidden, (self.proprioceptive_size + 1 - hidden) // 2, self.dt)
 
     def reset(self, key: Key[Array, ""]) -> State:
         """Start near the initial pose, with Gym's noise."""

@@ -9,7 +9,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float, Key
 
-from taic_jax.envs.base import Env, Goals, State
+from taic_jax.envs.base import Env, Goals, Heading, State
 from taic_jax.envs.views import Views
 
 
@@ -38,6 +38,11 @@ class Wrapper(Env):
     def goals(self) -> Goals | None:
         """Goals of the inner environment."""
         return self.env.goals
+
+    @property
+    def heading(self) -> Heading | None:
+        """Heading of the inner environment's body."""
+        return self.env.heading
 
     @property
     def evaluated(self) -> Env:

@@ -19,6 +19,7 @@ from taic_jax.envs.errors import RenderingError
 from taic_jax.nonfinite import without_stopped
 from taic_jax.options import learning
 from taic_jax.options.dataset import Dataset, Experience, holds_out, make_dataset
+from taic_jax.options.frame import make_frame
 from taic_jax.options.model import OptionModel
 from taic_jax.rl.agent import Agent
 from taic_jax.runtime.devices import make_devices
@@ -197,7 +198,7 @@ def select_windows(run: Run, env: Env) -> Dataset:
         else _for_points(gather_experience(Path(name), env, seeds), rows // seeds)
         for name in names
     ]
-    select = jax.vmap(partial(make_dataset, views=env.views))
+    select = jax.vmap(partial(make_dataset, views=env.views, frame=make_frame(config, env.heading)))
     dataset = _compile_rows(run, "learn", select, sources, config)(sources, config)
     span = f"in {', '.join(names)} between its shares {jnp.min(config.since):g} and {jnp.max(config.until):g}"
     if config.codes and (fewest := int(dataset.count.min())) < config.codes:

@@ -34,13 +34,14 @@ def make_envs(config: Config) -> tuple[Env, Env]:
             source = make_env(name, **{option: options[option] for option in shared})
     except UnknownNameError as error:
         raise ConfigError(f"{field}: {error}") from None
-    bodies = [(*describe(e).values(),)[1:] for e in (source, env)]
+    bodies = [(*describe(e).values(),)[1:-1] for e in (source, env)]
     if bodies[0] != bodies[1]:
         expected = f"the body of {config.env.name} (proprioceptive slice, its size, and action size {bodies[1]})"
         raise impossible("collect.env", f"{config.collect.env} with {bodies[0]}", expected)
     if config.train.ppo.reset_at_change and "changed" not in jax.eval_shape(env.reset, jax.random.key(0)).metrics:
         expected = "a task that changes, as nav2d does with env.change_after"
         raise impossible("train.ppo.reset_at_change", f"{config.env.name}, which never does", expected, False)
+    _check_heading(config, source)
     if config.options.views == "all" and len(source.views) == 1 and not config.options.source:
         expected = "a body with several equal sides, as ant has"
         raise impossible("options.views", f"all with {source.name}, which has one", expected, "one")
@@ -55,6 +56,15 @@ def make_envs(config: Config) -> tuple[Env, Env]:
             raise impossible(f"{name}.{group.learner}.relabel", got, expected, 0)
     _check_actions(config, env, source)
     return env, source
+
+
+def _check_heading(config: Config, source: Env) -> None:
+    """Raise ConfigError if options need a heading that the body lacks."""
+    options = config.options
+    for field, value, neutral in (("frame", options.frame, "world"), ("way_weight", options.way_weight, 0)):
+        if value != neutral and source.heading is None:
+            got = f"{value} with {source.name}, which has none"
+            raise impossible(f"options.{field}", got, "a body with a heading, as ant has", neutral)
 
 
 def _check_actions(config: Config, env: Env, source: Env) -> None:

@@ -204,7 +204,7 @@ def agents_of_rows(make: Callable[..., Trainer], rows: Row, states: Any) -> Agen
 
 def init_learning(env: Env, config: OptionsConfig, keys: Array) -> LearnState:
     """Return the states [K] before the first gradient step, for configs [K]."""
-    networks = make_networks(config, env.proprioceptive_size, env.action_size, env.discrete)
+    networks = make_networks(config, env.proprioceptive_size, env.action_size, env.discrete, env.heading)
     return jax.vmap(lambda config, key: learning.init(config, networks, key))(config, keys)
 
 

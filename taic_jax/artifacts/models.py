@@ -16,7 +16,7 @@ from safetensors import SafetensorError
 from taic_jax import __version__
 from taic_jax.artifacts.pretrained import locate
 from taic_jax.config import TAIC, OptionsConfig
-from taic_jax.envs.base import Env
+from taic_jax.envs.base import Env, Heading
 from taic_jax.options.model import OptionModel, Scale, init_params, make_networks
 from taic_jax.runtime.checkpoint import ArtifactError, Tree, checksums, fit_tree, plain_arrays
 from taic_jax.runtime.files import DESCRIPTION, atomic_file, read_description, save_json, writes_here, writing
@@ -26,11 +26,25 @@ FORMAT = 1  # of the two files; a later one is refused
 MODEL = "executor.model."  # begins the names of an option model's arrays among those of agents
 
 # The fields in which a frozen option model must agree with the config that uses it: its shapes and their meaning.
-STRUCTURE = ("decoder", "size", "length", "termination", "hidden_size", "mlp_sizes", "decoder_sizes", "codes")
+STRUCTURE = (
+    "decoder",
+    "size",
+    "length",
+    "termination",
+    "hidden_size",
+    "mlp_sizes",
+    "decoder_sizes",
+    "codes",
+    "frame",
+    "way_weight",
+)
 
 
 # What the first descriptions do not say, there being nothing else.
-EARLIER = {"learner": "ppo", "discrete": False, "options.codes": 0}
+EARLIER = {
+    "learner": "ppo", "discrete": False, "heading": None, "options.codes": 0, "options.frame": "world",
+    "options.way_weight": 0,
+}  # fmt: skip
 
 
 class Body(NamedTuple):
@@ -41,13 +55,15 @@ class Body(NamedTuple):
     proprioceptive_size: int
     action_size: int
     discrete: bool
+    heading: Heading | None
 
 
 def read_body(folder: Path) -> Body:
     """Return the body in an artifact's description, or raise ArtifactError without one."""
     description = EARLIER | (read_description(folder) or {})
     try:
-        return Body(description["env"], *(description[name] for name in Body._fields[1:]))
+        body = Body(description["env"], *(description[name] for name in Body._fields[1:]))
+        return body._replace(heading=body.heading and Heading(*body.heading))
     except KeyError:
         raise ArtifactError(f"{folder / DESCRIPTION}: expected the description of an artifact, got none") from None
 
@@ -60,13 +76,14 @@ def describe(env: Env | Body) -> dict[str, Any]:
         "proprioceptive_size": env.proprioceptive_size,
         "action_size": env.action_size,
         "discrete": env.discrete,
+        "heading": env.heading and list(env.heading),
     }
 
 
 def check_description(folder: Path, kind: str, env: Env | Body, fields: dict[str, Any]) -> dict[str, Any]:
     """Return an artifact's description, or raise ArtifactError where it differs from this body and these fields."""
     description = described(folder, kind)
-    body = {name: value for name, value in describe(env).items() if name != "env"}
+    body = {name: value for name, value in describe(env).items() if name not in ("env", "heading")}
     for name, value in {**body, **fields}.items():
         value = list(value) if isinstance(value, tuple) else value
         if description.get(name) != value:
@@ -147,10 +164,11 @@ def for_seeds(seeds: int, rows: Tree) -> Tree:
 
 def empty_model(env: Env | Body, config: OptionsConfig) -> OptionModel:
     """Return an option model of this structure, whose numbers are not meaningful."""
-    networks = make_networks(config, env.proprioceptive_size, env.action_size, env.discrete)
+    networks = make_networks(config, env.proprioceptive_size, env.action_size, env.discrete, env.heading)
     params, zeros = init_params(networks, config, jax.random.key(0)), jnp.zeros(env.proprioceptive_size)
+    changes = jnp.zeros(networks.predictor.change_size)
     book = jnp.zeros((config.codes, config.size)) if config.codes else None
-    return OptionModel(params, Scale(zeros, zeros), Scale(zeros, zeros), jnp.zeros(()), networks, book)
+    return OptionModel(params, Scale(zeros, zeros), Scale(changes, changes), jnp.zeros(()), networks, book)
 
 
 def rows_like(count: int, make: Callable[[], Any]) -> Any:

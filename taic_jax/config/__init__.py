@@ -48,7 +48,7 @@ class EnvConfig:
     model: Literal["brax", "gym"] = "brax"
     """MJCF and rules of half_cheetah, ant, hopper and walker2d: Brax's, or Gymnasium's own."""
     body: Literal["gym", "hiro"] = "gym"
-    """Ant of ant, ant_headings, ant_maze, ant_push and ant_fall: Gym's, or HIRO's, which is weaker and acts half as often."""
+    """Ant of ant, ant_headings and the arenas: Gym's, or HIRO's, which is weaker and acts half as often."""
     contacts: Literal["feet", "body"] = "feet"
     """Contacts of ant with the ground: those of its feet alone, or of its whole body, as in the arenas."""
     goal: Literal["fixed", "near", "uniform"] = "fixed"
@@ -135,6 +135,12 @@ class OptionsConfig:
     """Share of the windows that select top takes."""
     views: Literal["one", "all"] = "one"
     """Views of a window: the recorded one, or those of all the body's equal sides: the ant has four."""
+    frame: Literal["world", "heading"] = "world"
+    """Axes in which E, D, P and F see a body that can face anywhere: the world's, or those of its heading, D at each
+    tick, the others at the option's first."""
+    way_weight: Natural = 0
+    """Entries of the state for which each of the two of the way counts in L_pred: where the body went, as a part of
+    the state change; 0 leaves the way out."""
     state_noise: float = 0.0
     """Standard deviation of noise on the state that a closed-loop D learns from, so that it depends on the code; the
     unit is each entry's own standard deviation."""

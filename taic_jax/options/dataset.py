@@ -1,5 +1,6 @@
 """Windows of experience: action sequences with the states they pass through."""
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -10,6 +11,7 @@ from jaxtyping import Array, Float, Int
 
 from taic_jax.config import OptionsConfig
 from taic_jax.envs.views import Views, one_view
+from taic_jax.options.frame import Frame
 from taic_jax.options.model import Scale
 
 # Every tenth stretch of experience is held out if learning needs P's error on unseen windows. A stretch is several
@@ -68,7 +70,10 @@ def window_score(reward: Float[Array, "T B"], done: Array, length: int) -> tuple
 
 
 def make_dataset(
-    experience: Experience | Sequence[Experience], config: OptionsConfig, views: Views | None = None
+    experience: Experience | Sequence[Experience],
+    config: OptionsConfig,
+    views: Views | None = None,
+    frame: Frame | None = None,
 ) -> Dataset:
     """Select windows of `config.length` ticks and measure the scales over them.
 
@@ -79,6 +84,7 @@ def make_dataset(
       experience: one, or several of the same body; windows are selected from each separately, then merged.
       config: the settings of the selection; with `views="all"` the dataset has all views of the body.
       views: the views of the body; by default one.
+      frame: the one in which the model will see states; by default the world's.
 
     Raises:
       ShortExperienceError: windows must be held out, and no experience is long enough.
@@ -99,14 +105,17 @@ def make_dataset(
     starts = order[jnp.argsort(group, stable=True)]
     count, num_held_out = jnp.sum(group == 0, dtype=jnp.int32), jnp.sum(group == 1, dtype=jnp.int32)
     rows: Any = jax.tree.map(lambda *x: jnp.concatenate([flatten(y) for y in x]), *sources)
-    probe = starts[(jnp.arange(100_000.0) * (count.astype(jnp.float32) / 1e5)).astype(jnp.int32)]
+    probes = 10_000 if frame else 100_000  # with a frame all states of a window are read
+    probe = starts[(jnp.arange(float(probes)) * (count.astype(jnp.float32) / probes)).astype(jnp.int32)]
     if views is None or config.views == "one":
         views = one_view(rows.obs.shape[-1], rows.action.shape[-1])
-    states = jax.vmap(views.obs, (0, None))(
-        jnp.arange(len(views)), jnp.stack([rows.obs[probe], rows.obs[probe + config.length]])
-    )
-    state, end = jnp.swapaxes(states, 0, 1).reshape((2, -1, states.shape[-1]))
-    return Dataset(rows, starts, count, num_held_out, _scale(state), _scale(end - state), views)
+    ticks = jnp.arange(config.length + 1) if frame else jnp.array([0, config.length])
+    windows = rows.obs[probe[:, None] + ticks[None]]
+    windows = jax.vmap(views.obs, (0, None))(jnp.arange(len(views)), windows).reshape((-1, *windows.shape[1:]))
+    first, change = windows[:, 0], windows[:, -1] - windows[:, 0]
+    if frame:
+        first, change = frame.seen(first, first), jax.vmap(frame.changes)(windows)[:, -1]
+    return Dataset(rows, starts, count, num_held_out, _scale(first), _scale(change, frame), views)
 
 
 def holds_out(config: OptionsConfig) -> bool:
@@ -149,10 +158,13 @@ def flatten(x: Array) -> Array:
     return jnp.swapaxes(x, 0, 1).reshape((-1, *x.shape[2:]))
 
 
-def _scale(x: Float[Array, "N P"]) -> Scale:
+def _scale(x: Float[Array, "N P"], frame: Frame | None = None) -> Scale:
     # A constant entry, such as a fixed coordinate of an arena, must not be amplified.
     std = jnp.std(x, axis=0)
-    return Scale(jnp.mean(x, axis=0), jnp.where(std < 1e-4, 1.0, std))
+    std = jnp.where(std < 1e-4, 1.0, std)
+    if frame and frame.weight:  # the way comes last
+        std = std.at[-frame.way_size :].divide(math.sqrt(frame.weight))
+    return Scale(jnp.mean(x, axis=0), std)
 
 
 def gather(

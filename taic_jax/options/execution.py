@@ -119,10 +119,12 @@ class OptionExecutor(struct.PyTreeNode):
 
     def act(self, carry: Decoding, obs: Float[Array, " S"], noise: Float[Array, " X"]) -> tuple[Decoding, Array]:
         """Emit D's next action, with any noise, clipped to its bounds or one-hot."""
-        state = self.model.state_scale(self._state(obs))
-        next_carry, (output, end_logit) = self._decoder(carry.carry, carry.option, state, method="step")
+        state = self._state(obs)
+        next_carry, (output, end_logit) = self._decoder(
+            carry.carry, carry.option, self.model.see(state, state), method="step"
+        )
         action = self._action(output, noise[self.termination.noise_size :])
-        followed = self.termination.follow(self.model, carry.memory, action, end_logit)
+        followed = self.termination.follow(self.model, carry.memory, state, action, end_logit)
         return Decoding(carry.option, next_carry, followed), action
 
     def ended(self, carry: Decoding, obs: Float[Array, " S"], noise: Float[Array, " X"]) -> Bool[Array, ""]:

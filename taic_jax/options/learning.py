@@ -12,11 +12,20 @@ from flax import struct
 from jaxtyping import Array, Float, Int, Key
 
 from taic_jax.config import OptionsConfig
+from taic_jax.envs.base import Heading
 from taic_jax.envs.views import Views
 from taic_jax.nonfinite import earliest, first_nonfinite
 from taic_jax.options.code_book import centres
 from taic_jax.options.dataset import Dataset, Experience, Window, gather, make_dataset
-from taic_jax.options.losses import adversarial_loss, end_loss, gradient_reversal, kl_loss, reconstruction_loss
+from taic_jax.options.frame import make_frame
+from taic_jax.options.losses import (
+    adversarial_loss,
+    end_loss,
+    gradient_reversal,
+    kl_loss,
+    prediction_loss,
+    reconstruction_loss,
+)
 from taic_jax.options.model import Networks, OptionModel, init_params, make_networks
 from taic_jax.options.termination import prefix_errors, stop_index
 from taic_jax.types import Scalar, as_arrays
@@ -82,11 +91,10 @@ def window_losses(
         prediction = jnp.sum(jnp.where(mask, errors, 0.0))
     mean, log_std = means[last], log_stds[last]
     option = mean + jnp.exp(log_std) * noise
-    states = model.state_scale(window.states)
+    states = model.see(window.states, window.states[:1])
     if config.termination != "predict":
-        reached = jnp.stack([window.states[0], window.states[last + 1]])
-        prediction = prefix_errors(model, option[None], reached)[0]
-    decoded, end_logit = model.decode(option, states[:-1] + disturbance)
+        prediction = prediction_loss(model.predict(states[0], option), model.changes(window.states)[last])
+    decoded, end_logit = model.decode(option, model.see(window.states[:-1], window.states[:-1]) + disturbance)
     estimated = model.estimate(gradient_reversal(option, config.lambda_adv))
     losses = {
         "reconstruction_loss": reconstruction_loss(decoded, window.actions, mask, model.networks.discrete),
@@ -209,23 +217,25 @@ def learn(
     key: Key[Array, ""],
     views: Views | None = None,
     discrete: bool = False,
+    heading: Heading | None = None,
 ) -> tuple[OptionModel, dict[str, Array]]:
     """Learn an option model from experience [T, B, ...]; pure, so experiences and keys may be vmapped.
 
     Several experiences, of tasks that share the body, are merged. Returns the model and the losses of every step,
     leading axis the step. With `config.views` all, windows have all `views` of the body (`Env.views`). With
-    `discrete` actions are one-hot (`Env.discrete`).
+    `discrete` actions are one-hot (`Env.discrete`). `heading` is that of the body (`Env.heading`), for the config's
+    frame and way.
 
     Raises:
       ShortExperienceError: delta is a quantile, and no experience is long enough to hold a part out.
-      ValueError: `config.views` is all, and `views` is missing.
+      ValueError: `config.views` is all, and `views` is missing; or the frame needs a heading.
     """
     if config.views == "all" and views is None:
         raise ValueError("options.views: all needs the views of the body, as in learn(..., views=env.views); got none")
     config = as_arrays(config)
-    dataset = make_dataset(experience, config, views)
+    dataset = make_dataset(experience, config, views, make_frame(config, heading))
     rows = dataset.experience
-    networks = make_networks(config, rows.obs.shape[-1], rows.action.shape[-1], discrete)
+    networks = make_networks(config, rows.obs.shape[-1], rows.action.shape[-1], discrete, heading)
     state, losses = jax.lax.scan(lambda s, _: step(config, dataset, s), init(config, networks, key), None, config.steps)
     model = as_model(state, dataset)
     return model.replace(book=code_book(config, state, dataset)) if config.codes else model, losses

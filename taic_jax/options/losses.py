@@ -31,7 +31,7 @@ def kl_loss(mean: Float[Array, " D"], log_std: Float[Array, " D"]) -> Float[Arra
     return kl
 
 
-def prediction_loss(predicted: Float[Array, " P"], change: Float[Array, " P"]) -> Float[Array, ""]:
+def prediction_loss(predicted: Float[Array, " C"], change: Float[Array, " C"]) -> Float[Array, ""]:
     """Return L_pred (eq. 8): the mean squared error of the normalised state change."""
     return jnp.mean(jnp.square(predicted - change))
 

@@ -10,9 +10,12 @@ from flax import struct
 from jaxtyping import Array, Float, Int, Key
 
 from taic_jax.config import OptionsConfig
+from taic_jax.envs.base import Heading
 from taic_jax.networks import MLP, apply
+from taic_jax.options.frame import Frame, make_frame
 
 Carry = tuple[Array, Array]
+CLIP = 5.0  # standard deviations at which states in the frame of the heading are clipped
 
 
 def _lstm_cell(hidden_size: int) -> nn.OptimizedLSTMCell:
@@ -131,15 +134,15 @@ class ClosedDecoder(nn.Module):
 
 
 class Predictor(nn.Module):
-    """P: (s, o) -> s' as a normalised state change (eq. 8)."""
+    """P: (s, o) -> s' as a normalised state change (eq. 8) of C entries: the state's, and those of the way."""
 
-    state_size: int
+    change_size: int
     hidden_sizes: Sequence[int]
 
     @nn.compact
-    def __call__(self, state: Float[Array, " P"], option: Float[Array, " D"]) -> Float[Array, " P"]:
+    def __call__(self, state: Float[Array, " P"], option: Float[Array, " D"]) -> Float[Array, " C"]:
         """Predict the normalised change of a normalised state."""
-        return MLP((*self.hidden_sizes, self.state_size))(jnp.concatenate([state, option]))
+        return MLP((*self.hidden_sizes, self.change_size))(jnp.concatenate([state, option]))
 
 
 class StateEstimator(nn.Module):
@@ -162,10 +165,11 @@ class Networks(NamedTuple):
     predictor: Predictor
     estimator: StateEstimator
     discrete: bool  # D's output is logits of one-hot actions
+    frame: Frame | None = None  # None for the world's axes without the way
 
 
 class Scale(struct.PyTreeNode):
-    """Mean and standard deviation [P] over the experience of an option model."""
+    """Mean and standard deviation, [P] of states or [C] of changes, over the experience of an option model."""
 
     mean: Array
     std: Array
@@ -195,6 +199,23 @@ class OptionModel(struct.PyTreeNode):
         """P."""
         return self.state_scale.mean.shape[-1]
 
+    def see(self, states: Float[Array, "*batch P"], first: Float[Array, "*#batch P"]) -> Float[Array, "*batch P"]:
+        """Return normalised states, in the frame of the heading as seen from `first`, clipped there."""
+        if not (frame := self.networks.frame):
+            return self.state_scale(states)
+        seen = self.state_scale(frame.seen(states, first))
+        return jnp.clip(seen, -CLIP, CLIP) if frame.turns else seen
+
+    def changes(self, states: Float[Array, "T P"]) -> Float[Array, "T-1 C"]:
+        """Return the normalised change from the first state to each later one."""
+        frame = self.networks.frame
+        return self.change_scale(frame.changes(states) if frame else states[1:] - states[:1])
+
+    def change(self, state: Float[Array, " P"], first: Float[Array, " P"], way: Any) -> Float[Array, " C"]:
+        """Return the normalised change from the first state to another, by the way [2] with a frame."""
+        frame = self.networks.frame
+        return self.change_scale(frame.change(state, first, way) if frame else state - first)
+
     def encode(self, actions: Float[Array, "L A"]) -> tuple[Float[Array, "L D"], Float[Array, "L D"]]:
         """Return mean and log standard deviation of q(o|a_0..a_i) for each i."""
         return apply(self.networks.encoder, self.params["encoder"], actions)
@@ -205,7 +226,7 @@ class OptionModel(struct.PyTreeNode):
         """Return D's actions and end logits at normalised states; an open-loop D uses only their number."""
         return apply(self.networks.decoder, self.params["decoder"], option, states)
 
-    def predict(self, state: Float[Array, " P"], option: Float[Array, " D"]) -> Float[Array, " P"]:
+    def predict(self, state: Float[Array, " P"], option: Float[Array, " D"]) -> Float[Array, " C"]:
         """Return the normalised change of a normalised state under an option."""
         return apply(self.networks.predictor, self.params["predictor"], state, option)
 
@@ -218,8 +239,11 @@ class OptionModel(struct.PyTreeNode):
         return self.replace(params={**self.params, "decoder": params})
 
 
-def make_networks(config: OptionsConfig, state_size: int, action_size: int, discrete: bool = False) -> Networks:
-    """Return the modules for states [P] and actions [A], which are one-hot if `discrete`."""
+def make_networks(
+    config: OptionsConfig, state_size: int, action_size: int, discrete: bool = False, heading: Heading | None = None
+) -> Networks:
+    """Return the modules for states [P] and actions [A], which are one-hot if `discrete`, of a body with a heading."""
+    frame = make_frame(config, heading)
     if config.decoder == "closed":
         decoder = ClosedDecoder(action_size, tuple(config.decoder_sizes), config.length)
     else:
@@ -227,9 +251,10 @@ def make_networks(config: OptionsConfig, state_size: int, action_size: int, disc
     return Networks(
         Encoder(config.size, config.hidden_size),
         decoder,
-        Predictor(state_size, tuple(config.mlp_sizes)),
+        Predictor(state_size + (frame.way_size if frame else 0), tuple(config.mlp_sizes)),
         StateEstimator(state_size, tuple(config.mlp_sizes)),
         discrete,
+        frame,
     )
 
 
@@ -237,7 +262,7 @@ def init_params(networks: Networks, config: OptionsConfig, key: Key[Array, ""]) 
     """Return fresh parameters of all four networks."""
     key_e, key_d, key_p, key_f = jax.random.split(key, 4)
     actions = jnp.zeros((config.length, networks.decoder.action_size))
-    state, option = jnp.zeros(networks.predictor.state_size), jnp.zeros(config.size)
+    state, option = jnp.zeros(networks.estimator.state_size), jnp.zeros(config.size)
     return {
         "encoder": networks.encoder.init(key_e, actions),
         "decoder": networks.decoder.init(key_d, option, jnp.zeros((config.length, len(state)))),

@@ -32,9 +32,9 @@ def prefix_errors(
     model: OptionModel, options: Float[Array, "L D"], states: Float[Array, "L+1 P"]
 ) -> Float[Array, " L"]:
     """Return L_pred of every prefix of a window: the error of P(s_0, o_i) on s_{i+1} (Algorithm 1, lines 3-5)."""
-    start = model.state_scale(states[0])
+    start = model.see(states[0], states[0])
     predicted = jax.vmap(partial(model.predict, start))(options)
-    return jax.vmap(prediction_loss)(predicted, model.change_scale(states[1:] - states[:1]))
+    return jax.vmap(prediction_loss)(predicted, model.changes(states))
 
 
 @dataclass(frozen=True)
@@ -49,8 +49,10 @@ class Termination:
     def start(self, model: OptionModel, state: Float[Array, " P"]) -> Any:
         """Return the memory of an option that begins in this state."""
 
-    def follow(self, model: OptionModel, memory: Any, action: Float[Array, " A"], end_logit: Array) -> Any:
-        """Return the memory after D emitted an action and an end logit."""
+    def follow(
+        self, model: OptionModel, memory: Any, state: Float[Array, " P"], action: Float[Array, " A"], end_logit: Array
+    ) -> Any:  # fmt: skip
+        """Return the memory after D emitted an action and an end logit in this state."""
 
     def ended(self, model: OptionModel, memory: Any, state: Float[Array, " P"], noise: Array) -> Bool[Array, ""]:
         """Return whether the option ends in the state after the tick."""
@@ -72,7 +74,7 @@ class Output(Termination):
         return jnp.zeros(())
 
     def follow(
-        self, model: OptionModel, memory: Array, action: Float[Array, " A"], end_logit: Array
+        self, model: OptionModel, memory: Array, state: Array, action: Float[Array, " A"], end_logit: Array
     ) -> Float[Array, ""]:
         """Remember the logit."""
         return end_logit
@@ -85,11 +87,13 @@ class Output(Termination):
 
 
 class Following(struct.PyTreeNode):
-    """Memory of termination predict: the option's first state, E's carry, and E's code of the actions so far."""
+    """Memory of termination predict: the option's first state, E's carry, E's code of the actions so far, and the way
+    [2] so far, None without a frame."""
 
     start: Array
     carry: Carry
     option: Array
+    way: Any = None
 
 
 class Predict(Termination):
@@ -97,18 +101,24 @@ class Predict(Termination):
 
     def start(self, model: OptionModel, state: Float[Array, " P"]) -> Following:
         """Remember the option's first state."""
-        return Following(state, model.networks.encoder.start(), jnp.zeros(model.networks.encoder.option_size))
+        encoder, way = model.networks.encoder, jnp.zeros(2) if model.networks.frame else None
+        return Following(state, encoder.start(), jnp.zeros(encoder.option_size), way)
 
-    def follow(self, model: OptionModel, memory: Following, action: Float[Array, " A"], end_logit: Array) -> Following:
-        """Let E read the action."""
+    def follow(
+        self, model: OptionModel, memory: Following, state: Array, action: Float[Array, " A"], end_logit: Array
+    ) -> Following:
+        """Let E read the action, and add the tick's way."""
         params = model.params["encoder"]
         carry, (option, _) = apply(model.networks.encoder, params, memory.carry, action, method="step")
-        return memory.replace(carry=carry, option=option)
+        frame = model.networks.frame
+        way = memory.way + frame.way(state, memory.start) if frame else None
+        return memory.replace(carry=carry, option=option, way=way)
 
     def ended(self, model: OptionModel, memory: Following, state: Float[Array, " P"], noise: Array) -> Bool[Array, ""]:
         """End if the error of P(s_0, o_i) on the state after the tick is at least delta."""
-        states = jnp.stack([memory.start, state])
-        return prefix_errors(model, memory.option[None], states)[0] >= model.delta
+        predicted = model.predict(model.see(memory.start, memory.start), memory.option)
+        change = model.change(state, memory.start, memory.way)
+        return prediction_loss(predicted, change) >= model.delta
 
 
 def make_termination(config: OptionsConfig) -> Termination:

@@ -72,7 +72,8 @@ def _prior_codes(config: OptionsConfig, model: OptionModel, count: int) -> tuple
     option = jax.random.normal(jax.random.key(0), (count, config.size))
     predict = partial(model.predict, jnp.zeros(model.state_size))
     change = np.asarray(jax.vmap(predict)(option)) * np.asarray(model.change_scale.std)
-    return np.asarray(option), change + np.asarray(model.change_scale.mean)
+    change = (change + np.asarray(model.change_scale.mean))[:, : model.state_size]  # without the way
+    return np.asarray(option), change
 
 
 def principal_plane(option: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

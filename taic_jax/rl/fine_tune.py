@@ -134,7 +134,8 @@ def _rows(
     advantage = semi_markov_advantages(judgement, jnp.ones_like(ticks.ended), config.gamma, config.lambda_)
     model, tick = noisy.model, ticks.duration - 1
     option = fill_options(noisy.code(ticks.option), ticks.decision, running)
-    proprioception = model.state_scale(ticks.obs[..., : model.state_size])
+    states = ticks.obs[..., : model.state_size]
+    proprioception = model.see(states, states)
     means = jax.vmap(jax.vmap(partial(mean_action, model, noisy.length)))(option, proprioception, tick)
     action = means + noisy.std * ticks.noise[..., -means.shape[-1] :]
     log_prob = jax.vmap(partial(_log_prob, std=noisy.std))(action, means)
