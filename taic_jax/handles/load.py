@@ -10,7 +10,7 @@ from typing import Any
 import jax
 
 from taic_jax.artifacts.agents import load_agents, read_agents
-from taic_jax.artifacts.models import AGENTS, STRUCTURE, load_options, read_body
+from taic_jax.artifacts.models import AGENTS, EARLIER, STRUCTURE, load_options, read_body
 from taic_jax.artifacts.pretrained import locate
 from taic_jax.config import TAIC, CollectConfig, Config
 from taic_jax.config.files import from_mapping
@@ -79,6 +79,6 @@ def _handle(config: Config, agents: dict[str, Seeds[Agent]]) -> Handle:
 
 def _load_model(path: Path, description: dict[str, Any]) -> Handle:
     body = read_body(path)
-    structure = {name: description.get(f"options.{name}") for name in STRUCTURE}
+    structure = {name: (EARLIER | description).get(f"options.{name}") for name in STRUCTURE}
     config = from_mapping({"env": {"name": body.name}, "options": structure})
     return Handle(config, {}, Seeds(load_options(path, body, config.options, description["seeds"])))
