@@ -60,7 +60,10 @@ class Arena:
 
 
 MAZE = Arena(  # the near goal is as far off, but at the end of the first corridor
-    room=(-4.0, -4.0, 20.0, 20.0), solids=((-4.0, 4.0, 12.0, 12.0),), goal=(0.0, 16.0), near_goal=(16.0, 0.0),
+    room=(-4.0, -4.0, 20.0, 20.0),
+    solids=((-4.0, 4.0, 12.0, 12.0),),
+    goal=(0.0, 16.0),
+    near_goal=(16.0, 0.0),
     ways=(((-4, -4, 13, 4), (16, 0)), ((12, -4, 20, 13), (16, 16)), ((-4, 12, 20, 20), (0, 16))),
 )
 _ALONG_X, _ALONG_Y = Slide((1.0, 0.0, 0.0), (-8.0, 8.0), 1.0), Slide((0.0, 1.0, 0.0), (-8.0, 8.0), 1.0)
@@ -69,7 +72,12 @@ PUSH = Arena(
     solids=((4.0, -4.0, 12.0, 4.0), (-12.0, 12.0, -4.0, 20.0), (4.0, 12.0, 12.0, 20.0)),
     goal=(0.0, 19.0),
     # Around the block to the left, push it to the right, and through the gap behind it.
-    ways=(((-5, -4, 4, 4), (-8, 0)), ((-12, -4, -5, 5), (-8, 8)), ((-12, 4, 1, 12), (4, 8)), ((-4, 4, 12, 20), (0, 19))),
+    ways=(
+        ((-5, -4, 4, 4), (-8, 0)),
+        ((-12, -4, -5, 5), (-8, 8)),
+        ((-12, 4, 1, 12), (4, 8)),
+        ((-4, 4, 12, 20), (0, 19)),
+    ),
     block=Block(centre=(0.0, 8.0, 2.0), slides=(_ALONG_X, _ALONG_Y), meets=(0, 1, 2)),
 )
 # The block of the fall may rise a little: a limit at 0 would press it against the platform. Its fall is not damped.

@@ -1,8 +1,8 @@
 """A navigator without learning, which leads an ant through an arena by its options: a gate before long runs.
 
-Codes are measured on open ground. Then, at every decision, the navigator takes the one that leads best to the next place
-on the arena's way, and seldom overturns the ant. An arena is within reach of a policy over these options if it is
-within reach of the navigator.
+Codes are measured on open ground. Then, at every decision, the navigator takes the one that leads best to the next
+place on the arena's way, and seldom overturns the ant. An arena is within reach of a policy over these options if it
+is within reach of the navigator.
 """
 
 from functools import partial
@@ -30,8 +30,9 @@ RISK = 4.0  # m/s of speed that an overturned ant in every start is worth
 
 
 class Compass(NamedTuple):
-    """Codes [M, D], the velocity [M, 2] in m/s at which each leads, in the frame of the options, the agreement [M] of
-    its ways from several starts, the length of the mean of their unit vectors, and the share [M] of ants it overturns."""
+    """Codes [M, D], and of each the velocity [M, 2] in m/s at which it leads, in the frame of the options; the agreement
+    [M] of its ways from several starts, the length of the mean of their unit vectors; the share [M] of ants it overturns.
+    """
 
     codes: Array
     velocity: Array
@@ -59,7 +60,9 @@ def measure_codes(env: Env, executor: Executor, frame: Frame | None, key: Key[Ar
     key_codes, key_start, key_warm_up, key_run = jax.random.split(key, 4)
     env = AutoReset(Unending(env))
     codes, others = jax.random.normal(key_codes, (2, CODES, executor.option_size))
-    repeated, before = (jnp.repeat(x, STARTS, axis=0) for x in (codes, others[jax.random.permutation(key_warm_up, CODES)]))
+    repeated, before = (
+        jnp.repeat(x, STARTS, axis=0) for x in (codes, others[jax.random.permutation(key_warm_up, CODES)])
+    )
     begin = start(env, executor, CODES * STARTS, key_start)
     begin, _ = rollout(env, executor, partial(always, before), begin, key_warm_up, round(WARM_UP / env.dt))
     upright = begin.env.metrics["upside_down"] == 0.0

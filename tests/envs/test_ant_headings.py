@@ -1,0 +1,90 @@
+"""The ant that goes where it should, and the contacts of its body."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from taic_jax.envs import UnknownNameError, make_env
+from taic_jax.envs.ant_tasks import HOLD, SPREAD, heading, turned, unit
+
+KEYS = jax.random.split(jax.random.key(0), 16)
+
+
+@pytest.fixture(scope="module")
+def walk():
+    """States [T, B] of ants under random actions."""
+    env = make_env("ant_headings", "mujoco")
+    actions = jax.random.uniform(jax.random.key(1), (150, 16, 8), minval=-1.0)
+
+    def tick(state, action):
+        state = jax.vmap(env.step)(state, action)
+        return state, state
+
+    first = jax.jit(jax.vmap(env.reset))(KEYS)
+    return env, actions, first, jax.jit(lambda state: jax.lax.scan(tick, state, actions)[1])(first)
+
+
+def test_directions_are_near_the_x_axis_and_change_every_three_seconds(walk):
+    _, _, first, states = walk
+    directions = np.asarray(first.physics.directions)
+    assert np.abs(directions).max() <= SPREAD and directions.std() > SPREAD / 2
+    phase = first.physics.tick % HOLD
+    assert len(set(phase.tolist())) > 4, "they turn at different times"
+    seen, yaw = states.obs[..., 27:29], jax.vmap(jax.vmap(heading))(states.physics.qpos[..., 3:7])
+    angle = jnp.arctan2(seen[..., 1], seen[..., 0]) + yaw
+    changes = np.abs(np.diff(np.unwrap(angle, axis=0), axis=0)) > 1e-3
+    where = np.arange(2, 151)[:, None] + np.asarray(phase)
+    np.testing.assert_array_equal(changes, where % HOLD == 0)
+
+
+def test_the_reward_is_of_the_speed_along_the_direction_by_hand(walk):
+    _, actions, first, states = walk
+    before = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b[:-1]]), first, states)
+    velocity = (states.physics.qpos[..., :2] - before.physics.qpos[..., :2]) / 0.05
+    tick = before.physics.tick
+    angle = jnp.take_along_axis(before.physics.directions, tick[..., None] // HOLD, axis=-1)[..., 0]
+    along = velocity[..., 0] * jnp.cos(angle) + velocity[..., 1] * jnp.sin(angle)
+    across = velocity[..., 1] * jnp.cos(angle) - velocity[..., 0] * jnp.sin(angle)
+    _, x, y, _ = jnp.moveaxis(states.physics.qpos[..., 3:7], -1, 0)
+    upright = 1 - 2 * (x**2 + y**2)
+    expected = along - 0.5 * jnp.abs(across) + upright - 0.1 * jnp.sum(actions**2, axis=-1)
+    np.testing.assert_allclose(states.reward, expected, atol=1e-3)
+    np.testing.assert_array_equal(states.terminated, upright < 0)
+    assert states.terminated.any() and not states.terminated[0].any()
+
+
+def test_direction_and_velocity_are_seen_from_the_heading(walk):
+    env, _, first, _ = walk
+    assert env.observation_size == 31 and env.proprioceptive_size == 27
+    state = jax.tree.map(lambda x: x[0], first)
+    for yaw in (0.0, 1.0, -2.5):
+        qpos = state.physics.qpos.at[3:7].set(jnp.array([np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)]))
+        qvel = state.physics.qvel.at[:2].set(3 * unit(jnp.float32(yaw)))
+        obs = env.env._observe(state.physics.replace(qpos=qpos, qvel=qvel))
+        direction = unit(state.physics.directions[state.physics.tick // HOLD])
+        np.testing.assert_allclose(obs[27:29], turned(direction, jnp.float32(-yaw)), atol=1e-5)
+        np.testing.assert_allclose(obs[29:], [3, 0], atol=1e-5)
+
+
+def test_the_body_on_open_ground_moves_as_in_the_arenas():
+    """The same state and actions, on the floor: only feet differ, by more than 0.1 m after 20 ticks."""
+    actions, places = jax.random.uniform(jax.random.key(2), (20, 8), minval=-1.0), {}
+    low = jax.jit(make_env("ant", "mujoco", contacts="body").reset)(KEYS[0])
+    for name, options in (("ant", {"contacts": "body"}), ("ant", {}), ("ant_maze", {}), ("ant_headings", {})):
+        env = make_env(name, "mujoco", **options)
+        state, step = jax.jit(env.reset)(KEYS[0]), jax.jit(env.step)
+        qpos = low.physics.qpos.at[2].set(0.3).at[7:].set(0.0)  # the belly touches the ground
+        state = state.replace(physics=state.physics.replace(qpos=qpos, qvel=low.physics.qvel))
+        for action in actions:
+            state = step(state, action)
+        places[name, bool(options)] = np.asarray(state.physics.qpos[:3])
+    body = places["ant", True]
+    np.testing.assert_allclose(places["ant_maze", False], body, atol=2e-2)
+    np.testing.assert_allclose(places["ant_headings", False], body, atol=2e-2)
+    assert np.linalg.norm(places["ant", False] - body) > 0.1
+
+
+def test_unknown_contacts_are_refused():
+    with pytest.raises(UnknownNameError, match="contacts"):
+        make_env("ant", "mujoco", contacts="feat")
