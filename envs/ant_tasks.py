@@ -54,8 +54,9 @@ class HeadingsState(PhysicsState):
 class AntHeadings(Locomotion):
     """Go in a direction and do not fall: experience for options that steer.
 
-    The direction is within 45 degrees of the x axis, and is drawn anew every three seconds. The reward of a tick is the speed in m/s along the direction, less half the speed across it and the control cost,
-    plus the upward part of the torso's own axis: 1 if it is level. Only an ant on its back ends the episode.
+    The direction is within 45 degrees of the x axis, and is drawn anew every three seconds. The reward of a tick is the
+    speed in m/s along it, less half the speed across it and the control cost, plus the upward part of the torso's own
+    axis: 1 if it is level. Only an ant on its back ends the episode.
 
     Observation: the 27 entries of `ant`; then, seen from the ant's heading, the direction [2] and the torso's
     horizontal velocity [2].

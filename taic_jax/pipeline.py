@@ -13,7 +13,17 @@ from taic_jax import trainer
 from taic_jax.artifacts.agents import Weights, save_agents
 from taic_jax.artifacts.experience import EXPERIENCE, ExperienceStore, gather_experience, num_blocks
 from taic_jax.artifacts.models import AGENTS, OPTIONS, describe, save_options
-from taic_jax.config import COLLECT, TAIC, Config, ConfigError, Shard, collector_is_baseline, impossible, needs_collect
+from taic_jax.config import (
+    COLLECT,
+    PRACTISE,
+    TAIC,
+    Config,
+    ConfigError,
+    Shard,
+    collector_is_baseline,
+    impossible,
+    needs_collect,
+)
 from taic_jax.envs.base import Env
 from taic_jax.envs.errors import RenderingError
 from taic_jax.nonfinite import without_stopped
@@ -22,6 +32,7 @@ from taic_jax.options.dataset import Dataset, Experience, holds_out, make_datase
 from taic_jax.options.frame import make_frame
 from taic_jax.options.model import OptionModel
 from taic_jax.rl.agent import Agent
+from taic_jax.rl.practise import decoder_of
 from taic_jax.runtime.devices import make_devices
 from taic_jax.runtime.driver import Run, drive
 from taic_jax.runtime.files import save_json
@@ -77,6 +88,7 @@ def run_pipeline(
     ) as run:
         collector = collect(run, source) if needs_collect(config) else None
         model = learn(run, source) if model is None else model
+        model = practise(run, source, model) if config.practise.ticks else model
         methods = {TAIC: train_over_options(run, env, model, policy)}
         for name in config.train.baselines:
             # If experience comes from the task itself, the collector is the flat baseline.
@@ -180,6 +192,16 @@ def learn(run: Run, env: Env) -> OptionModel:
         book = _compile_rows(run, "learn", trainer.books_of_rows, config, state, dataset)(config, state, dataset)
         model = model.replace(book=book)
     save_options(run.folder.path / OPTIONS, model, env, config)
+    return model
+
+
+def practise(run: Run, env: Env, model: OptionModel) -> OptionModel:
+    """Refine D of every seed's model, refit the other networks to it, and save the models in place of the learnt."""
+    params: Any = _train(run, env, PRACTISE, model).agent.params
+    model = model.with_decoder(jax.vmap(decoder_of)(params.actor, model.params["decoder"]))
+    args = run.config, model, run.stage_keys(PRACTISE)
+    model, _ = _compile_rows(run, PRACTISE, partial(trainer.refit_rows, env), *args)(*args)
+    save_options(run.folder.path / OPTIONS, model, env, run.config.options)
     return model
 
 

@@ -11,7 +11,7 @@ from jaxtyping import Array
 
 from taic_jax.analysis.evaluate import evaluate
 from taic_jax.artifacts.experience import as_experience
-from taic_jax.config import COLLECT, Config, OptionsConfig, ReplayConfig, replace, settings_of
+from taic_jax.config import COLLECT, PRACTISE, Config, OptionsConfig, PPOConfig, ReplayConfig, replace, settings_of
 from taic_jax.envs.base import Env
 from taic_jax.networks import PolicyParams
 from taic_jax.options import learning
@@ -19,10 +19,11 @@ from taic_jax.options.dataset import Dataset, Experience
 from taic_jax.options.execution import Executor, IdentityExecutor, OptionExecutor, make_executor
 from taic_jax.options.learning import LearnState
 from taic_jax.options.model import OptionModel, make_networks
-from taic_jax.rl import fine_tune, normalize, ppo, refresh
+from taic_jax.rl import fine_tune, normalize, ppo, practise, refresh
 from taic_jax.rl.agent import Agent
 from taic_jax.rl.fine_tune import Tuned
 from taic_jax.rl.learner import Settings, learner_of, num_iterations
+from taic_jax.rl.practise import Practising
 
 STEPS_PER_LOG = 100
 
@@ -104,6 +105,26 @@ class OptionTrainer(Trainer):
         return make_executor(self.config.options, self.model)
 
 
+class PractiseTrainer(Trainer):
+    """D of a model, by flat PPO on the task of going where codes say."""
+
+    @property
+    def settings(self) -> PPOConfig:
+        """Settings of PPO, with D's layers."""
+        return practise.settings(self.config.practise, self.config.options)
+
+    def init(self, key: Array) -> ppo.TrainState:
+        """Return the state whose actor is the learnt D."""
+        assert self.model is not None
+        state = super().init(key)
+        params = practise.actor_of(self.model.params["decoder"], state.params)
+        return state.replace(params=params, obs_statistics=normalize.identity(self.env.observation_size))
+
+    def step(self, state: ppo.TrainState) -> tuple[ppo.TrainState, dict, None]:
+        """Run one iteration; return the next state and metrics."""
+        return *super().step(state)[:2], None
+
+
 class FineTuneTrainer(OptionTrainer):
     """A policy over options whose D is fine-tuned on the same ticks (§5)."""
 
@@ -169,10 +190,14 @@ Row = tuple[Config, OptionModel | None]
 
 def make_trainer(stage: str, env: Env, config: Config, model: OptionModel | None = None) -> Trainer:
     """Return the trainer of a stage: `collect`, `train` over a model's options, or one of `train.baselines`."""
-    if model is not None:
+    if model is not None and stage != PRACTISE:
         kind = RefreshTrainer if config.options.refresh_every else OptionTrainer
         kind = FineTuneTrainer if config.train.fine_tune.epochs else kind
         return kind(env, config, config.train.ticks, model=model)
+    if stage == PRACTISE:
+        assert model is not None
+        task = Practising(env, config.options, config.practise, model)
+        return PractiseTrainer(task, config, config.practise.ticks, model=model)
     ticks = {COLLECT: config.collect.ticks, "total": config.collect.ticks + config.train.ticks}
     hold = config.options.length if stage == "repeat" else 1
     return Trainer(env, config, ticks.get(stage, config.train.ticks), hold)
@@ -222,6 +247,15 @@ def books_of_rows(config: OptionsConfig, states: LearnState, dataset: Dataset) -
 def steps_per_log(config: OptionsConfig) -> int:
     """Return the gradient steps of one step of stage learn, a divisor of their total."""
     return max(n for n in range(1, STEPS_PER_LOG + 1) if config.steps % n == 0)
+
+
+def refit_rows(env: Env, config: Config, models: OptionModel, keys: Array) -> tuple[OptionModel, dict[str, Array]]:
+    """Refit E, P and F of practised models [K]."""
+
+    def one(config: Config, model: OptionModel, key: Array) -> tuple[OptionModel, dict[str, Array]]:
+        return practise.refit(config.options, config.practise, env, model, key)
+
+    return jax.vmap(one)(config, models, keys)
 
 
 class Trained(NamedTuple):

@@ -25,9 +25,9 @@ from taic_jax.config.base import (
 from taic_jax.config.learners import DQNConfig, FineTuneConfig, PPOConfig, ReplayConfig, SACConfig
 
 __all__ = [
-    "COLLECT", "CONFIG_CLASSES", "METHOD_LABELS", "TAIC", "TINY", "USUAL_BOUNDS", "Bounds", "CollectConfig", "Config",
+    "COLLECT", "CONFIG_CLASSES", "METHOD_LABELS", "PRACTISE", "TAIC", "TINY", "USUAL_BOUNDS", "Bounds", "CollectConfig", "Config",
     "ConfigError", "DQNConfig", "EnvConfig", "EvaluateConfig", "FineTuneConfig", "Learner", "Natural", "OptionsConfig",
-    "PPOConfig", "Positive", "ReplayConfig", "SACConfig", "Shard", "Share", "Track", "TrainConfig",
+    "PPOConfig", "Positive", "PractiseConfig", "ReplayConfig", "SACConfig", "Shard", "Share", "Track", "TrainConfig",
     "collector_is_baseline", "experience_ticks", "field_types", "impossible", "method_label", "needs_collect",
     "replace", "settings_of", "walk",
 ]  # fmt: skip
@@ -158,6 +158,25 @@ class OptionsConfig:
 
 
 @dataclass(frozen=True)
+class PractiseConfig:
+    """Stage practise: D of a body with a heading learns on-policy to go where codes say; off unless it has ticks."""
+
+    ticks: Natural = 0
+    """Budget of interactions per seed; 0 leaves D as learnt."""
+    hold: int = 3
+    """Most options for which a code from the prior is held."""
+    control_cost: float = 0.1
+    """Weight of |action|^2 in the reward."""
+    upright: float = 1.0
+    """Weight of the upward part of the torso's own axis in the reward."""
+    refit_steps: int = 1000
+    """Gradient steps at the end that refit E, P and F to D."""
+    ppo: PPOConfig = PPOConfig(
+        rollout_length=256, minibatch_size=256, log_std_init=-1.9, normalize_reward=True, hidden_sizes=(128, 128)
+    )
+
+
+@dataclass(frozen=True)
 class TrainConfig:
     """Stage train: the policy that acts by choosing options (section 3.5)."""
 
@@ -193,6 +212,7 @@ class Config:
     env: EnvConfig = EnvConfig()
     collect: CollectConfig = CollectConfig()
     options: OptionsConfig = OptionsConfig()
+    practise: PractiseConfig = PractiseConfig()
     train: TrainConfig = TrainConfig()
     evaluate: EvaluateConfig = EvaluateConfig()
     seed: Annotated[int, Bounds(0, 2**31 - 1)] = 0
@@ -202,12 +222,12 @@ class Config:
 
 
 CONFIG_CLASSES = (
-    EnvConfig, PPOConfig, ReplayConfig, SACConfig, DQNConfig, CollectConfig, OptionsConfig, FineTuneConfig, TrainConfig,
-    EvaluateConfig, Config,
+    EnvConfig, PPOConfig, ReplayConfig, SACConfig, DQNConfig, CollectConfig, OptionsConfig, PractiseConfig,
+    FineTuneConfig, TrainConfig, EvaluateConfig, Config,
 )  # fmt: skip
 
-COLLECT = "collect"
-"""This run's own experience, as a name in `options.experience`."""
+COLLECT, PRACTISE = "collect", "practise"
+"""Stages by name; that of this run's own experience also in `options.experience`."""
 
 TAIC = "taic"
 METHOD_LABELS = {

@@ -31,10 +31,11 @@ S = TypeVar("S")
 
 STAGE_STREAMS = {
     "collect": 0, "learn": 1, "train": 2, "flat": 3, "evaluate": 4, "video": 5, "repeat": 6, "total": 7, "transfer": 8,
+    "practise": 9,
 }  # fmt: skip
 """The stream of random numbers of each stage. A number is never reused: old runs draw from it."""
 # The stages whose results a stage starts from: a seed that stopped there stays stopped.
-BUILDS_ON = {"learn": ("collect",), "train": ("collect", "learn")}
+BUILDS_ON = {"learn": ("collect",), "practise": ("collect", "learn"), "train": ("collect", "learn", "practise")}
 CHECKPOINT_SECONDS = 30.0
 DUMPS = "dumps"
 

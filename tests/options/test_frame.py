@@ -36,7 +36,7 @@ def walks():
         physics = first.physics
         qpos = physics.qpos.at[3:7].set(product(turn_of(angle), physics.qpos[3:7]))
         qpos = qpos.at[:2].set(rotated(qpos[:2], angle))
-        qvel = physics.qvel.at[:2].set(rotated(physics.qvel[:2] + jnp.array([3.0, 1.0]), angle))
+        qvel = physics.qvel.at[:2].set(rotated(physics.qvel[:2] + jnp.array([6.0, 3.0]), angle))
         physics = physics.replace(qpos=qpos, qvel=qvel)
         state = first.replace(physics=physics, obs=jnp.concatenate([qpos[2:], qvel]))
 

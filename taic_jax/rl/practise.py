@@ -1,0 +1,178 @@
+"""Practice: D is refined on-policy on open ground, so that a code leads where it says from every start.
+
+Codes from the prior are held for one or more options each. D acts through its own mean, and is learnt by flat PPO,
+whose actor it is: its input is the observation of the task `Practising`. A code says where it leads by P, as learnt
+before: the way that P predicts from the mean state.
+"""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Float, Key
+
+from taic_jax.config import OptionsConfig, PPOConfig, PractiseConfig
+from taic_jax.envs.base import Env, State
+from taic_jax.envs.wrappers import AutoReset, Wrapper
+from taic_jax.networks import PolicyParams
+from taic_jax.options.dataset import Window, gather
+from taic_jax.options.execution import make_executor
+from taic_jax.options.learning import descend
+from taic_jax.options.losses import adversarial_loss, prediction_loss
+from taic_jax.options.model import OptionModel
+from taic_jax.rl import refresh
+from taic_jax.rl.rollout import rollout, start
+
+METRICS = ("speed_along", "speed_across", "upright")
+REFIT_ENVS, REFIT_OPTIONS = 64, 40
+"""Environments, and options in each, from which E and P are refitted."""
+
+
+class PracticeState(struct.PyTreeNode):
+    """The simulation, and the code that is practised."""
+
+    inner: Any
+    code: Array  # [D]
+    direction: Array  # [2] seen from the heading, of length 1
+    left: Array  # [] int32, options for which the code is still held
+    tick: Array  # [] int32, within the option
+    key: Array
+
+
+class Practising(Wrapper):
+    """A task whose observation is D's input: the state that D sees, a code from the prior, and the share of its ticks.
+
+    The reward of a tick is the speed in m/s in the code's direction, seen from the heading, less half the speed across
+    it and the control cost, plus the upward part of the body's own axis. Episodes end as those of the inner task.
+    """
+
+    def __init__(self, env: Env, options: OptionsConfig, config: PractiseConfig, model: OptionModel):
+        super().__init__(env)
+        self.model, self.options, self.config = model, options, config
+        self.name = f"practice of {env.name}"
+        self.observation_size = self.proprioceptive_size = model.state_size + options.size + 1
+
+    def reset(self, key: Key[Array, ""]) -> State:
+        """Start the inner task, and draw a code."""
+        key_inner, key = jax.random.split(key)
+        inner = self.env.reset(key_inner)
+        zero = jnp.zeros((), jnp.int32)
+        practice = PracticeState(inner, jnp.zeros(self.options.size), jnp.zeros(2), zero, zero, key)
+        practice = self._draw(practice)
+        return State.first(practice, self._observe(practice), dict.fromkeys(METRICS, jnp.zeros(())))
+
+    def step(self, state: State, action: Float[Array, " A"]) -> State:
+        """Act in the inner task; at the end of the last option of a code, draw another."""
+        before: PracticeState = state.physics
+        inner = self.env.step(before.inner, action)
+        reward, metrics = self._judge(before, inner.obs[: self.model.state_size], action)
+        tick = before.tick + 1
+        ended = tick >= self.options.length
+        left = before.left - ended.astype(jnp.int32)
+        practice = before.replace(inner=inner, tick=jnp.where(ended, 0, tick), left=left)
+        fresh = self._draw(practice)
+        practice = jax.tree.map(lambda new, old: jnp.where(left <= 0, new, old), fresh, practice)
+        flags = {"terminated": inner.terminated, "truncated": inner.truncated}
+        return state.replace(physics=practice, obs=self._observe(practice), reward=reward, metrics=metrics, **flags)
+
+    def _draw(self, practice: PracticeState) -> PracticeState:
+        key, key_code, key_left = jax.random.split(practice.key, 3)
+        code = jax.random.normal(key_code, (self.options.size,))
+        left = jax.random.randint(key_left, (), 1, self.config.hold + 1)
+        return practice.replace(code=code, direction=direction(self.model, code), left=left, key=key)
+
+    def _observe(self, practice: PracticeState) -> Float[Array, " S"]:
+        state = practice.inner.obs[: self.model.state_size]
+        share = practice.tick.astype(jnp.float32) / self.options.length
+        return jnp.concatenate([self.model.see(state, state), practice.code, share[None]])
+
+    def _judge(
+        self, before: PracticeState, state: Float[Array, " P"], action: Float[Array, " A"]
+    ) -> tuple[Array, dict[str, Array]]:
+        frame: Any = self.model.networks.frame
+        first = before.inner.obs[: self.model.state_size]
+        velocity = frame.way(state, first) / self.dt
+        along = velocity @ before.direction
+        across = jnp.abs(velocity[0] * before.direction[1] - velocity[1] * before.direction[0])
+        at = frame.heading.quaternion
+        upright = 1 - 2 * (state[at + 1] ** 2 + state[at + 2] ** 2)
+        reward = along - 0.5 * across + self.config.upright * upright
+        reward -= self.config.control_cost * jnp.sum(action**2)
+        return reward, dict(zip(METRICS, (along, across, upright), strict=True))
+
+
+def direction(model: OptionModel, code: Float[Array, " D"]) -> Float[Array, " 2"]:
+    """Return where a code leads by P from the mean state, seen from the heading; of length 1."""
+    predicted = model.predict(jnp.zeros(model.state_size), code)
+    way = (predicted * model.change_scale.std + model.change_scale.mean)[-2:]
+    return way / jnp.maximum(jnp.linalg.norm(way), 1e-6)
+
+
+def settings(config: PractiseConfig, options: OptionsConfig) -> PPOConfig:
+    """Return the settings of PPO, whose actor has the hidden layers of D."""
+    return dataclasses.replace(config.ppo, hidden_sizes=options.decoder_sizes)
+
+
+def actor_of(decoder: Any, fresh: PolicyParams) -> PolicyParams:
+    """Return fresh parameters of PPO whose actor is a closed-loop D without its end logit."""
+    layers = dict(decoder["params"]["mlp"])
+    last = f"Dense_{len(layers) - 1}"
+    layers[last] = jax.tree.map(lambda x: x[..., :-1], layers[last])
+    return fresh.replace(actor={"params": layers})
+
+
+def decoder_of(actor: Any, decoder: Any) -> Any:
+    """Return D with the layers of an actor, and its own end logit."""
+    layers = dict(actor["params"])
+    last, own = f"Dense_{len(layers) - 1}", decoder["params"]["mlp"]
+    joined = jax.tree.map(lambda new, old: jnp.concatenate([new, old[..., -1:]], axis=-1), layers[last], own[last])
+    return {"params": {"mlp": layers | {last: joined}}}
+
+
+def refit(
+    options: OptionsConfig, config: PractiseConfig, env: Env, model: OptionModel, key: Key[Array, ""]
+) -> tuple[OptionModel, dict[str, Array]]:
+    """Learn E, P and F further from what codes of the prior do now, drawn anew for every option; D stays.
+
+    E learns the likelihood of the code of its actions, since it shall still tell which option an action sequence is.
+    Returns the model and the losses of every step.
+    """
+    key_start, key_run, key_steps = jax.random.split(key, 3)
+    env, executor = AutoReset(env), make_executor(dataclasses.replace(options, termination="fixed"), model)
+    begin = start(env, executor, REFIT_ENVS, key_start)
+    ticks = REFIT_OPTIONS * options.length
+    _, run = rollout(env, executor, lambda obs, noise: (noise, jnp.zeros(len(obs))), begin, key_run, ticks)
+    own = refresh.own_options(run, model)
+
+    def step(state: Any, key: Array) -> tuple[Any, dict[str, Array]]:
+        which = jax.random.randint(key, (options.batch_size,), 0, own.windows.count)
+        windows = gather(own.windows, which, own.duration[which], options.length)
+        return descend(refit_loss, options, model, state, windows, own.code[which])
+
+    learnt, losses = jax.lax.scan(
+        step, refresh.init(options, model, key), jax.random.split(key_steps, config.refit_steps)
+    )
+    return model.replace(params=learnt.params), losses
+
+
+def refit_loss(
+    params: dict, model: OptionModel, options: OptionsConfig, windows: Window, codes: Float[Array, "N D"]
+) -> tuple[Float[Array, ""], dict[str, Array]]:
+    """Return the mean loss of E, P and F over N whole windows of these codes, and its terms."""
+    model = model.replace(params=params)
+
+    def one(window: Window, code: Float[Array, " D"]) -> dict[str, Array]:
+        means, log_stds = model.encode(window.actions)
+        z = (code - means[-1]) / jnp.exp(log_stds[-1])
+        states = model.see(window.states, window.states[:1])
+        change = model.changes(window.states)[-1]
+        return {
+            "encoder_loss": jnp.mean(0.5 * jnp.square(z) + log_stds[-1]),
+            "prediction_loss": prediction_loss(model.predict(states[0], code), change),
+            "adversarial_loss": adversarial_loss(model.estimate(code), states[0], states[-1]),
+        }
+
+    terms = jax.tree.map(jnp.mean, jax.vmap(one)(windows, codes))
+    return sum(terms.values(), jnp.zeros(())), terms
