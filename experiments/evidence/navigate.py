@@ -31,7 +31,7 @@ RISK = 4.0  # m/s of speed that an overturned ant in every start is worth
 
 class Compass(NamedTuple):
     """Codes [M, D], and of each the velocity [M, 2] in m/s at which it leads, in the frame of the options; `agreement`
-    [M] of its ways from several starts, the length of the mean of their unit vectors; `overturned` [M], a share of ants.
+    [M] of its ways from several starts, the length of the mean of their unit vectors; `overturned` [M], a share of all.
     """
 
     codes: Array

@@ -25,11 +25,11 @@ from taic_jax.config.base import (
 from taic_jax.config.learners import DQNConfig, FineTuneConfig, PPOConfig, ReplayConfig, SACConfig
 
 __all__ = [
-    "COLLECT", "CONFIG_CLASSES", "METHOD_LABELS", "PRACTISE", "TAIC", "TINY", "USUAL_BOUNDS", "Bounds", "CollectConfig", "Config",
-    "ConfigError", "DQNConfig", "EnvConfig", "EvaluateConfig", "FineTuneConfig", "Learner", "Natural", "OptionsConfig",
-    "PPOConfig", "Positive", "PractiseConfig", "ReplayConfig", "SACConfig", "Shard", "Share", "Track", "TrainConfig",
-    "collector_is_baseline", "experience_ticks", "field_types", "impossible", "method_label", "needs_collect",
-    "replace", "settings_of", "walk",
+    "COLLECT", "CONFIG_CLASSES", "METHOD_LABELS", "PRACTISE", "TAIC", "TINY", "USUAL_BOUNDS", "Bounds",
+    "CollectConfig", "Config", "ConfigError", "DQNConfig", "EnvConfig", "EvaluateConfig", "FineTuneConfig", "Learner",
+    "Natural", "OptionsConfig", "PPOConfig", "Positive", "PractiseConfig", "ReplayConfig", "SACConfig", "Shard",
+    "Share", "Track", "TrainConfig", "collector_is_baseline", "experience_ticks", "field_types", "impossible",
+    "method_label", "needs_collect", "replace", "settings_of", "walk",
 ]  # fmt: skip
 
 
