@@ -57,7 +57,14 @@ class Practising(Wrapper):
     def reset(self, key: Key[Array, ""]) -> State:
         """Start the inner task, and draw a code."""
         key_inner, key = jax.random.split(key)
-        inner = self.env.reset(key_inner)
+        return self._start(self.env.reset(key_inner), key)
+
+    def restart(self, key: Key[Array, ""], ended: PracticeState) -> State:
+        """Do so after an episode of the inner task."""
+        key_inner, key = jax.random.split(key)
+        return self._start(self.env.restart(key_inner, ended.inner.physics), key)
+
+    def _start(self, inner: State, key: Key[Array, ""]) -> State:
         zero = jnp.zeros((), jnp.int32)
         practice = PracticeState(inner, jnp.zeros(self.options.size), jnp.zeros(2), zero, zero, key)
         practice = self._draw(practice)
