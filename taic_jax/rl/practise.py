@@ -31,9 +31,10 @@ REFIT_ENVS, REFIT_OPTIONS = 64, 40
 
 
 class PracticeState(struct.PyTreeNode):
-    """The simulation, and the code that is practised."""
+    """The inner task, which resets itself, and the code that is practised; `obs` is the observation of both."""
 
-    inner: Any
+    inner: State
+    obs: Array
     code: Array  # [D]
     direction: Array  # [2] seen from the heading, of length 1
     left: Array  # [] int32, options for which the code is still held
@@ -45,11 +46,12 @@ class Practising(Wrapper):
     """A task whose observation is D's input: the state that D sees, a code from the prior, and the share of its ticks.
 
     The reward of a tick is the speed in m/s in the code's direction, seen from the heading, less half the speed across
-    it and the control cost, plus the upward part of the body's own axis. Episodes end as those of the inner task.
+    it and the control cost, plus the upward part of the body's own axis. Episodes end as those of the inner task, which
+    resets itself: what resets a batch under `vmap` may not read a model of its own in each row.
     """
 
     def __init__(self, env: Env, options: OptionsConfig, config: PractiseConfig, model: OptionModel):
-        super().__init__(env)
+        super().__init__(AutoReset(env))
         self.model, self.options, self.config = model, options, config
         self.name = f"practice of {env.name}"
         self.observation_size = self.proprioceptive_size = model.state_size + options.size + 1
@@ -57,41 +59,43 @@ class Practising(Wrapper):
     def reset(self, key: Key[Array, ""]) -> State:
         """Start the inner task, and draw a code."""
         key_inner, key = jax.random.split(key)
-        return self._start(self.env.reset(key_inner), key)
+        zero, nothing = jnp.zeros((), jnp.int32), jnp.zeros(self.options.size)
+        inner = self.env.reset(key_inner)
+        practice = PracticeState(inner, jnp.zeros(self.observation_size), nothing, jnp.zeros(2), zero, zero, key)
+        practice = self._draw(practice)
+        return State.first(practice, practice.obs, dict.fromkeys(METRICS, jnp.zeros(())))
 
     def restart(self, key: Key[Array, ""], ended: PracticeState) -> State:
-        """Do so after an episode of the inner task."""
-        key_inner, key = jax.random.split(key)
-        return self._start(self.env.restart(key_inner, ended.inner.physics), key)
-
-    def _start(self, inner: State, key: Key[Array, ""]) -> State:
-        zero = jnp.zeros((), jnp.int32)
-        practice = PracticeState(inner, jnp.zeros(self.options.size), jnp.zeros(2), zero, zero, key)
-        practice = self._draw(practice)
-        return State.first(practice, self._observe(practice), dict.fromkeys(METRICS, jnp.zeros(())))
+        """Go on: the inner task has restarted already."""
+        return State.first(ended, ended.obs, {})
 
     def step(self, state: State, action: Float[Array, " A"]) -> State:
-        """Act in the inner task; at the end of the last option of a code, draw another."""
+        """Act in the inner task; at its end, or that of a code's last option, draw another code."""
         before: PracticeState = state.physics
         inner = self.env.step(before.inner, action)
-        reward, metrics = self._judge(before, inner.obs[: self.model.state_size], action)
+        reward, metrics = self._judge(before, inner.final_obs[: self.model.state_size], action)
         tick = before.tick + 1
         ended = tick >= self.options.length
         left = before.left - ended.astype(jnp.int32)
         practice = before.replace(inner=inner, tick=jnp.where(ended, 0, tick), left=left)
-        fresh = self._draw(practice)
-        practice = jax.tree.map(lambda new, old: jnp.where(left <= 0, new, old), fresh, practice)
+        practice = practice.replace(obs=self._observe(practice, inner.obs))
+        new = (left <= 0) | inner.terminated | inner.truncated
+        practice = jax.tree.map(lambda x, y: jnp.where(new, x, y), self._draw(practice), practice)
+        final = self._observe(before.replace(tick=tick), inner.final_obs)
+        obs = jnp.where(inner.terminated | inner.truncated, final, practice.obs)
         flags = {"terminated": inner.terminated, "truncated": inner.truncated}
-        return state.replace(physics=practice, obs=self._observe(practice), reward=reward, metrics=metrics, **flags)
+        return state.replace(physics=practice, obs=obs, reward=reward, metrics=metrics, **flags)
 
     def _draw(self, practice: PracticeState) -> PracticeState:
+        """Begin an option of another code."""
         key, key_code, key_left = jax.random.split(practice.key, 3)
         code = jax.random.normal(key_code, (self.options.size,))
-        left = jax.random.randint(key_left, (), 1, self.config.hold + 1)
-        return practice.replace(code=code, direction=direction(self.model, code), left=left, key=key)
+        left, tick = jax.random.randint(key_left, (), 1, self.config.hold + 1), jnp.zeros((), jnp.int32)
+        practice = practice.replace(code=code, direction=direction(self.model, code), left=left, tick=tick, key=key)
+        return practice.replace(obs=self._observe(practice, practice.inner.obs))
 
-    def _observe(self, practice: PracticeState) -> Float[Array, " S"]:
-        state = practice.inner.obs[: self.model.state_size]
+    def _observe(self, practice: PracticeState, obs: Float[Array, " I"]) -> Float[Array, " S"]:
+        state = obs[: self.model.state_size]
         share = practice.tick.astype(jnp.float32) / self.options.length
         return jnp.concatenate([self.model.see(state, state), practice.code, share[None]])
 
