@@ -15,6 +15,7 @@ from taic_jax.analysis.statistics import iqm, summarize
 from taic_jax.artifacts.experience import experience_bytes
 from taic_jax.config import (
     COLLECT,
+    PRACTISE,
     Config,
     ReplayConfig,
     collector_is_baseline,
@@ -45,6 +46,8 @@ def plan(config: Config, env: Env, source: Env) -> str:
     collect, options, train, collects = config.collect, config.options, config.train, needs_collect(config)
     flat = settings_of(collect)
     rows = [("collect", source, flat, collect.ticks)] if collects else []
+    if config.practise.ticks:
+        rows.append((PRACTISE, source, config.practise.ppo, config.practise.ticks))
     rows.append(("train", env, settings_of(train), train.ticks))
     for name in train.baselines:
         if not (name == "flat" and collector_is_baseline(config)):

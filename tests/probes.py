@@ -10,6 +10,7 @@ from jax import Array
 
 from taic_jax.config import OptionsConfig
 from taic_jax.envs import Env, State
+from taic_jax.envs.base import Heading
 from taic_jax.options.model import OptionModel, Scale, init_params, make_networks
 
 
@@ -155,12 +156,15 @@ def draw(rng: np.random.Generator, *shape: int) -> jax.Array:
     return jnp.asarray(rng.normal(size=shape), jnp.float32)
 
 
-def random_model(config: OptionsConfig, state_size: int, action_size: int) -> OptionModel:
+def random_model(
+    config: OptionsConfig, state_size: int, action_size: int, heading: Heading | None = None
+) -> OptionModel:
     """Return an option model whose parameters and scales are drawn at random."""
-    rng, networks = np.random.default_rng(0), make_networks(config, state_size, action_size)
+    rng, networks = np.random.default_rng(0), make_networks(config, state_size, action_size, heading=heading)
     shapes = jax.eval_shape(lambda: init_params(networks, config, jax.random.key(0)))
     params = jax.tree.map(lambda leaf: draw(rng, *leaf.shape), shapes)
-    scales = [Scale(draw(rng, state_size), jnp.exp(draw(rng, state_size))) for _ in range(2)]
+    sizes = state_size, networks.predictor.change_size
+    scales = [Scale(draw(rng, size), jnp.exp(draw(rng, size))) for size in sizes]
     return OptionModel(params, *scales, jnp.ones(()), networks)
 
 

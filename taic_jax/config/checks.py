@@ -4,7 +4,7 @@ import math
 from operator import ge, le
 from typing import Annotated, Any, get_args, get_origin
 
-from taic_jax.config import USUAL_BOUNDS, Config, field_types, impossible, walk
+from taic_jax.config import USUAL_BOUNDS, Config, OptionsConfig, field_types, impossible, walk
 
 REPLAYS = ("collect.sac", "collect.dqn", "train.sac", "train.dqn")
 
@@ -33,9 +33,22 @@ def validate(config: Config) -> None:
         expected = "0 with train.fine_tune.epochs, which changes D too"
         raise impossible("options.refresh_every", options.refresh_every, expected, 0)
     _check_learners(config)
+    if config.practise.ticks:
+        _check_practice(options)
     if "transfer" in baselines and not options.source:
         expected = "with transfer a run with options and a flat policy"
         raise impossible("train.baselines", "none: add --options RUN", expected)
+
+
+def _check_practice(options: OptionsConfig) -> None:
+    """Check that codes of the options can be practised: D has to see the state, and codes have to say where they go."""
+    for name, value, needed, why in (
+        ("decoder", options.decoder, "closed", "since an open-loop D cannot react"),
+        ("frame", options.frame, "heading", "from which a code's direction is seen"),
+        ("way_weight", options.way_weight or None, options.way_weight or 16, "so that P tells where a code leads"),
+    ):
+        if value != needed:
+            raise impossible(f"options.{name}", value or 0, f"{needed} with practise.ticks, {why}", needed)
 
 
 def _check_learners(config: Config) -> None:
@@ -80,7 +93,8 @@ def _check_limits(config: Config) -> None:
     """Check the fields whose bounds are other fields, or products of them."""
     values, baselines = dict(walk(config)), config.train.baselines
     flat, over_options = f"collect.{config.collect.learner}", f"train.{config.train.learner}"
-    collected, trained = (f"{x}.num_envs * {x}.rollout_length" for x in (flat, over_options))
+    flats = (flat, over_options, "practise.ppo")
+    collected, trained, practised = (f"{x}.num_envs * {x}.rollout_length" for x in flats)
     by_ppo, refreshes = over_options == "train.ppo", config.options.refresh_every
     for applies, name, allowed, expected, other in (
         (flat == "collect.ppo", "collect.ppo.minibatch_size", le, "at most", collected),
@@ -89,6 +103,8 @@ def _check_limits(config: Config) -> None:
         *((True, f"{x}.update_every", le, "at most", f"{x}.rollout_length") for x in REPLAYS),
         (config.train.fine_tune.epochs, "train.fine_tune.minibatch_size", le, "at most", trained),
         (True, "train.ticks", ge, "at least one iteration,", trained),
+        (config.practise.ticks, "practise.ticks", ge, "at least one iteration,", practised),
+        (config.practise.ticks, "practise.ppo.minibatch_size", le, "at most", practised),
         (refreshes, "train.ticks", ge, "at least one refresh,", f"{trained} * options.refresh_every"),
         (by_ppo, "options.length", le, "at most", "train.ppo.rollout_length"),
         (True, "options.shortest", le, "at most", "options.length"),

@@ -5,12 +5,12 @@ from typing import Any
 import numpy as np
 
 from taic_jax.analysis.statistics import bootstrap_interval, iqm
-from taic_jax.config import COLLECT, TAIC, method_label
+from taic_jax.config import COLLECT, PRACTISE, TAIC, method_label
 from taic_jax.report.runs import LoadedRun, ReportError, per_seed, read_run, run_of
 from taic_jax.runtime.files import json_safe
 
 DIGITS = 5  # significant, of curves
-STAGES = {"train": TAIC, "learn": "learning of options"}
+STAGES = {"train": TAIC, "learn": "learning of options", PRACTISE: "practice of options"}
 
 
 def label_of(run: LoadedRun, stage: str) -> str:
@@ -51,11 +51,13 @@ def pretraining(run: LoadedRun, stage: str, above: tuple[str, ...] = ()) -> tupl
         return _spent_in(source, COLLECT, above)
     if stage not in ("train", "learn"):
         return 0, []
+    practised = run.ticks(PRACTISE) if stage == "train" else 0
     if source:
-        return _spent_in(source, "train", above)
+        spent, unreadable = _spent_in(source, "train", above)
+        return practised + spent, unreadable
     experience = [str(name) for name in run.fields.get("options.experience") or [COLLECT]]
     spent = [(run.ticks(name), []) if name == COLLECT else _spent_in(name, COLLECT, above) for name in experience]
-    return sum(ticks for ticks, _ in spent), [name for _, names in spent for name in names]
+    return practised + sum(ticks for ticks, _ in spent), [name for _, names in spent for name in names]
 
 
 def _spent_in(name: str, stage: str, above: tuple[str, ...]) -> tuple[int, list[str]]:

@@ -1,0 +1,192 @@
+"""Practice: its task by hand, D as PPO's actor, and a sled that learns to go where codes say."""
+
+import dataclasses
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from probes import NO, assert_trees_equal, random_model
+from tiny_runs import CONFIG, PPO, with_fields
+
+from taic_jax.config import Config, ConfigError, OptionsConfig, PPOConfig, PractiseConfig
+from taic_jax.config.checks import validate
+from taic_jax.envs import AutoReset, Env, State, TimeLimit
+from taic_jax.envs.base import Heading
+from taic_jax.options.execution import IdentityExecutor, make_executor
+from taic_jax.rl import ppo, practise
+from taic_jax.rl.practise import Practising
+from taic_jax.rl.rollout import rollout, start
+from taic_jax.trainer import make_trainer
+from taic_jax.types import as_arrays
+
+L, HOLD = 4, 3
+OPTIONS = as_arrays(OptionsConfig(
+    length=L, size=2, hidden_size=8, mlp_sizes=(16,), decoder_sizes=(16,), batch_size=64, decoder="closed",
+    frame="heading", way_weight=2, learning_rate=3e-3,
+))  # fmt: skip
+PRACTICE = PractiseConfig(
+    ticks=30_000, hold=HOLD, refit_steps=300,
+    ppo=PPOConfig(num_envs=16, rollout_length=32, minibatch_size=128, log_std_init=-0.5, learning_rate=1e-2),
+)  # fmt: skip
+
+
+class Sled(Env):
+    """A sled that faces anywhere, whose action is its velocity in its own frame."""
+
+    name = proprioception = "sled"
+    observation_size = proprioceptive_size = 6
+    action_size = 2
+    episode_length, dt = 50, 0.5
+    heading = Heading(quaternion=0, velocity=4, dt=0.5)
+
+    def reset(self, key):
+        half = jax.random.uniform(key, (), minval=-3.1, maxval=3.1) / 2
+        obs = jnp.array([1.0, 0, 0, 0, 0, 0]).at[0].set(jnp.cos(half)).at[3].set(jnp.sin(half))
+        return State.first(obs, obs, {})
+
+    def step(self, state, action):
+        w, z = state.obs[0], state.obs[3]
+        c, s = w**2 - z**2, 2 * w * z
+        velocity = jnp.stack([c * action[0] - s * action[1], s * action[0] + c * action[1]])
+        obs = state.obs.at[4:].set(velocity)
+        return state.replace(physics=obs, obs=obs, terminated=NO, truncated=NO)
+
+    def render(self, physics, *, height=240, width=320):
+        raise NotImplementedError
+
+
+SLED = TimeLimit(Sled(), 50)
+
+
+@pytest.fixture(scope="module")
+def model():
+    model = random_model(OPTIONS, 6, 2, Sled.heading)
+    return model.replace(params=jax.tree.map(lambda x: 0.3 * x, model.params))  # so that D's actions are within bounds
+
+
+@pytest.fixture(scope="module")
+def task(model):
+    return Practising(SLED, OPTIONS, PRACTICE, model)
+
+
+@pytest.fixture(scope="module")
+def walk(task):
+    """Ticks [T, B] of random actions: actions and states."""
+    actions = jax.random.uniform(jax.random.key(1), (120, 8, 2), minval=-1.0)
+    env = AutoReset(task)
+
+    def tick(state, action):
+        state = jax.vmap(env.step)(state, action)
+        return state, state
+
+    first = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 8))
+    return actions, first, jax.jit(lambda state: jax.lax.scan(tick, state, actions)[1])(first)
+
+
+def fresh(task):
+    """Return fresh parameters of PPO on the task."""
+    policy = ppo.make_policy(IdentityExecutor(2), practise.settings(PRACTICE, OPTIONS))
+    return policy, policy.init(jax.random.key(0), task.observation_size, -1.0)
+
+
+def test_the_observation_is_the_input_of_d(task, model, walk):
+    """PPO's actor does in the task what the executor does with the code."""
+    policy, params = fresh(task)
+    params, executor = practise.actor_of(model.params["decoder"], params), make_executor(OPTIONS, model)
+    practice = walk[2].physics
+    for t, b in ((0, 0), (5, 1), (50, 2), (77, 7)):
+        state = practice.inner.obs[t, b]
+        carry = executor.start(practice.code[t, b], state)
+        for _ in range(int(practice.tick[t, b]) + 1):
+            carry, action = executor.act(carry, state, jnp.zeros(0))
+        np.testing.assert_allclose(np.clip(policy.mode(params, practice.obs[t, b]), -1, 1), action, atol=1e-5)
+        np.testing.assert_array_equal(practice.obs[t, b], walk[2].obs[t, b])
+
+
+def test_d_becomes_the_actor_and_the_actor_d(task, model):
+    decoder = model.params["decoder"]
+    params = practise.actor_of(decoder, fresh(task)[1])
+    assert_trees_equal(practise.decoder_of(params.actor, decoder), decoder)
+    other = jax.tree.map(lambda x: x + 1.0, params.actor)
+    changed = practise.decoder_of(other, decoder)["params"]["mlp"]["Dense_1"]
+    np.testing.assert_array_equal(changed["kernel"][:, :2], decoder["params"]["mlp"]["Dense_1"]["kernel"][:, :2] + 1.0)
+    np.testing.assert_array_equal(changed["kernel"][:, 2:], decoder["params"]["mlp"]["Dense_1"]["kernel"][:, 2:])
+
+
+def test_the_reward_is_of_the_speed_in_the_codes_direction(model, walk):
+    actions, first, states = walk
+    before = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b[:-1]]), first.physics, states.physics)
+    directions = jax.vmap(jax.vmap(partial(practise.direction, model)))(before.code)
+    np.testing.assert_allclose(directions, before.direction, atol=1e-5)
+    np.testing.assert_allclose(np.linalg.norm(directions, axis=-1), 1.0, atol=1e-5)
+    way = model.predict(jnp.zeros(6), before.code[3, 3]) * model.change_scale.std + model.change_scale.mean
+    np.testing.assert_allclose(directions[3, 3], way[-2:] / np.linalg.norm(way[-2:]), atol=1e-5)
+    along = jnp.sum(actions * directions, axis=-1)  # the sled's own frame is the heading's
+    across = jnp.abs(actions[..., 0] * directions[..., 1] - actions[..., 1] * directions[..., 0])
+    expected = along - 0.5 * across + 1.0 - 0.1 * jnp.sum(actions**2, axis=-1)
+    np.testing.assert_allclose(states.reward, expected, atol=1e-4)
+
+
+def test_codes_are_held_for_whole_options_and_end_with_episodes(walk):
+    _, _, states = walk
+    practice, done = states.physics, np.asarray(states.truncated)
+    assert (done.sum(axis=0) == 2).all() and not np.asarray(states.terminated).any()
+    changes = np.abs(np.diff(practice.code, axis=0)).max(axis=-1) > 0
+    held = {b: np.diff(np.flatnonzero(changes[:, b])) for b in range(8)}
+    lengths = {int(n) for b in held for n in held[b]}
+    assert {L, 2 * L, HOLD * L} <= lengths and max(lengths) == HOLD * L
+    assert changes[done[1:]].all(), "a new episode has a new code"
+    np.testing.assert_array_equal(practice.tick[1:][changes], 0)
+    share = states.obs[..., -1]
+    np.testing.assert_allclose(share[~done], practice.tick[~done] / L, atol=1e-6)
+    np.testing.assert_allclose(states.obs[..., 6:8], practice.code, atol=1e-6)
+
+
+def test_a_sled_learns_to_go_where_its_codes_say_and_keeps_its_other_networks(model):
+    trainer = make_trainer("practise", SLED, as_arrays(Config(options=OPTIONS, practise=PRACTICE)), model)
+    state = jax.jit(trainer.init)(jax.random.key(0))
+    step, first = jax.jit(trainer.step), None
+    for _ in range(trainer.num_steps):
+        state, metrics, _ = step(state)
+        first = metrics if first is None else first
+    assert metrics["mean/speed_along"] > 0.8 > 0.4 > first["mean/speed_along"]
+    np.testing.assert_allclose(state.obs_statistics.mean, 0.0, atol=1e-3)
+    np.testing.assert_allclose(state.obs_statistics.std, 1.0, atol=1e-3)
+    practised = model.with_decoder(practise.decoder_of(state.params.actor, model.params["decoder"]))
+    refitted, losses = jax.jit(partial(practise.refit, OPTIONS, PRACTICE, SLED))(practised, jax.random.key(3))
+    assert_trees_equal(refitted.params["decoder"], practised.params["decoder"])
+    windows, codes = executed(refitted)
+    means = jax.vmap(refitted.encode)(windows)[0][:, -1]
+    assert np.corrcoef(np.ravel(means), np.ravel(codes))[0, 1] > 0.9, "E reads the code from the actions"
+    assert np.mean(losses["prediction_loss"][-20:]) < 0.5 * np.mean(losses["prediction_loss"][:20])
+
+
+def executed(model):
+    """Return the actions [N, L, A] of codes [N, D]."""
+    env, executor = AutoReset(SLED), make_executor(OPTIONS, model)
+    begin = start(env, executor, 64, jax.random.key(7))
+    codes = jax.random.normal(jax.random.key(8), (64, 2))
+    _, ticks = rollout(env, executor, lambda obs, noise: (codes, jnp.zeros(64)), begin, jax.random.key(9), L)
+    return jnp.swapaxes(ticks.action, 0, 1), codes
+
+
+VALID = {"options__decoder": "closed", "options__frame": "heading", "options__way_weight": 8, "practise__ticks": 16}
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"options__decoder": "open"}, "options.decoder: expected closed with practise.ticks, since an open-loop D"),
+        ({"options__frame": "world"}, "options.frame: expected heading with practise.ticks, from which"),
+        ({"options__way_weight": 0}, "options.way_weight: expected 16 with practise.ticks, so that P tells"),
+        ({"practise__ticks": 15}, "practise.ticks: expected at least one iteration"),
+    ],
+)
+def test_what_cannot_be_practised_is_refused(fields, message):
+    config = with_fields(dataclasses.replace(CONFIG, practise=PractiseConfig(ppo=PPO)), **VALID)
+    validate(config)
+    with pytest.raises(ConfigError) as error:
+        validate(with_fields(config, **fields))
+    assert message in str(error.value)
