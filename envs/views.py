@@ -22,6 +22,16 @@ class Views(struct.PyTreeNode):
         """V."""
         return self.obs_order.shape[-2]
 
+    def nearest(self, direction: Float[Array, " 2"]) -> Int[Array, ""]:
+        """Return the view of four that a direction chooses: 0 along the first axis, then each a quarter turn on."""
+        x, y = direction
+        along = jnp.where(x > 0.0, 0, 2)
+        return jnp.where(jnp.abs(x) >= jnp.abs(y), along, jnp.where(y > 0.0, 1, 3)).astype(jnp.int32)
+
+    def back(self, view: Int[Array, ""]) -> Int[Array, ""]:
+        """Return the view that undoes a view: all are turns by the same angle."""
+        return (len(self) - view) % len(self)
+
     def obs(self, view: Int[Array, ""], obs: Float[Array, "*batch P"]) -> Float[Array, "*batch P"]:
         """Return proprioceptive slices in a view."""
         return obs[..., self.obs_order[view]] * jnp.broadcast_to(self.obs_sign[view], obs.shape)
@@ -34,10 +44,10 @@ class Views(struct.PyTreeNode):
 Signed = tuple[tuple[int, int], ...]  # For each entry the index of the one that takes its place, and its sign.
 
 
-def one_view(obs_size: int, action_size: int) -> Views:
-    """Return the view of a body that looks different from every side."""
+def one_view(obs_size: int, action_size: int, count: int = 1) -> Views:
+    """Return the view of a body that looks different from every side, `count` times."""
     obs, action = (tuple((i, 1) for i in range(size)) for size in (obs_size, action_size))
-    return make_views(obs, action, 1)
+    return make_views(obs, action, count)
 
 
 def make_views(obs: Signed, action: Signed, count: int) -> Views:

@@ -34,7 +34,7 @@ def make_envs(config: Config) -> tuple[Env, Env]:
             source = make_env(name, **{option: options[option] for option in shared})
     except UnknownNameError as error:
         raise ConfigError(f"{field}: {error}") from None
-    bodies = [(*describe(e).values(),)[1:-1] for e in (source, env)]
+    bodies = [(*describe(e).values(),)[1:-2] for e in (source, env)]
     if bodies[0] != bodies[1]:
         expected = f"the body of {config.env.name} (proprioceptive slice, its size, and action size {bodies[1]})"
         raise impossible("collect.env", f"{config.collect.env} with {bodies[0]}", expected)

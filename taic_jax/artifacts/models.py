@@ -17,6 +17,7 @@ from taic_jax import __version__
 from taic_jax.artifacts.pretrained import locate
 from taic_jax.config import TAIC, OptionsConfig
 from taic_jax.envs.base import Env, Heading
+from taic_jax.envs.views import one_view
 from taic_jax.options.model import OptionModel, Scale, init_params, make_networks
 from taic_jax.runtime.checkpoint import ArtifactError, Tree, checksums, fit_tree, plain_arrays
 from taic_jax.runtime.files import DESCRIPTION, atomic_file, read_description, save_json, writes_here, writing
@@ -37,13 +38,14 @@ STRUCTURE = (
     "codes",
     "frame",
     "way_weight",
+    "choose_view",
 )
 
 
 # What the first descriptions do not say, there being nothing else.
 EARLIER = {
     "learner": "ppo", "discrete": False, "heading": None, "options.codes": 0, "options.frame": "world",
-    "options.way_weight": 0,
+    "options.way_weight": 0, "options.choose_view": False, "sides": 1,
 }  # fmt: skip
 
 
@@ -55,6 +57,7 @@ class Body(NamedTuple):
     proprioceptive_size: int
     action_size: int
     discrete: bool
+    sides: int
     heading: Heading | None
 
 
@@ -76,6 +79,7 @@ def describe(env: Env | Body) -> dict[str, Any]:
         "proprioceptive_size": env.proprioceptive_size,
         "action_size": env.action_size,
         "discrete": env.discrete,
+        "sides": env.sides if isinstance(env, Body) else len(env.views),
         "heading": env.heading and list(env.heading),
     }
 
@@ -83,7 +87,7 @@ def describe(env: Env | Body) -> dict[str, Any]:
 def check_description(folder: Path, kind: str, env: Env | Body, fields: dict[str, Any]) -> dict[str, Any]:
     """Return an artifact's description, or raise ArtifactError where it differs from this body and these fields."""
     description = described(folder, kind)
-    body = {name: value for name, value in describe(env).items() if name not in ("env", "heading")}
+    body = {name: value for name, value in describe(env).items() if name not in ("env", "sides", "heading")}
     for name, value in {**body, **fields}.items():
         value = list(value) if isinstance(value, tuple) else value
         if description.get(name) != value:
@@ -168,7 +172,11 @@ def empty_model(env: Env | Body, config: OptionsConfig) -> OptionModel:
     params, zeros = init_params(networks, config, jax.random.key(0)), jnp.zeros(env.proprioceptive_size)
     changes = jnp.zeros(networks.predictor.change_size)
     book = jnp.zeros((config.codes, config.size)) if config.codes else None
-    return OptionModel(params, Scale(zeros, zeros), Scale(changes, changes), jnp.zeros(()), networks, book)
+    model = OptionModel(params, Scale(zeros, zeros), Scale(changes, changes), jnp.zeros(()), networks, book)
+    if not config.choose_view:
+        return model
+    count = describe(env)["sides"]
+    return model.replace(views=one_view(env.proprioceptive_size, env.action_size, count))
 
 
 def rows_like(count: int, make: Callable[[], Any]) -> Any:

@@ -138,6 +138,9 @@ class OptionsConfig:
     frame: Literal["world", "heading"] = "world"
     """Axes in which E, D, P and F see a body that can face anywhere: the world's, or those of its heading, D at each
     tick, the others at the option's first."""
+    choose_view: bool = False
+    """Let two more entries of an option choose the view in which it is executed: by their direction one of the body's
+    equal sides is the front."""
     way_weight: Natural = 0
     """Entries of the state for which each of the two of the way counts in L_pred: where the body went, as a part of
     the state change; 0 leaves the way out."""

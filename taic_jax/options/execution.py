@@ -72,11 +72,12 @@ class IdentityExecutor(struct.PyTreeNode):
 
 
 class Decoding(struct.PyTreeNode):
-    """A running option: its code, D's carry, and the termination rule's memory of it."""
+    """A running option: its code, D's carry, the termination rule's memory of it, and its view, None without choice."""
 
     option: Array
     carry: Any
     memory: Any
+    view: Any = None
 
 
 class OptionExecutor(struct.PyTreeNode):
@@ -94,8 +95,8 @@ class OptionExecutor(struct.PyTreeNode):
 
     @property
     def option_size(self) -> int:
-        """D, or the codes of the book."""
-        return self.codes or self.model.networks.encoder.option_size
+        """D, two more if the option chooses its view; or the codes of the book."""
+        return self.codes or self.model.networks.encoder.option_size + (2 if self.model.views is not None else 0)
 
     @property
     def discrete(self) -> bool:
@@ -109,27 +110,36 @@ class OptionExecutor(struct.PyTreeNode):
 
     def code(self, option: Float[Array, "*batch M"]) -> Float[Array, "*batch D"]:
         """Return the codes of options."""
-        return option @ self.model.book if self.codes else option
+        if self.codes:
+            return option @ self.model.book
+        return option if self.model.views is None else option[..., :-2]
+
+    def view(self, option: Float[Array, " M"]) -> Any:
+        """Return the view that an option chooses, or None."""
+        return None if self.model.views is None else self.model.views.nearest(option[-2:])
 
     def start(self, option: Float[Array, " M"], obs: Float[Array, " S"]) -> Decoding:
         """Set D's carry from the code."""
-        code = self.code(option)
+        code, view = self.code(option), self.view(option)
         carry = self._decoder(code, method="start")
-        return Decoding(code, carry, self.termination.start(self.model, self._state(obs)))
+        return Decoding(code, carry, self.termination.start(self.model, self._state(obs, view)), view)
 
     def act(self, carry: Decoding, obs: Float[Array, " S"], noise: Float[Array, " X"]) -> tuple[Decoding, Array]:
         """Emit D's next action, with any noise, clipped to its bounds or one-hot."""
-        state = self._state(obs)
+        state = self._state(obs, carry.view)
         next_carry, (output, end_logit) = self._decoder(
             carry.carry, carry.option, self.model.see(state, state), method="step"
         )
         action = self._action(output, noise[self.termination.noise_size :])
         followed = self.termination.follow(self.model, carry.memory, state, action, end_logit)
-        return Decoding(carry.option, next_carry, followed), action
+        if carry.view is not None:
+            action = self.model.views.action(self.model.views.back(carry.view), action)
+        return Decoding(carry.option, next_carry, followed, carry.view), action
 
     def ended(self, carry: Decoding, obs: Float[Array, " S"], noise: Float[Array, " X"]) -> Bool[Array, ""]:
         """Ask the termination rule."""
-        return self.termination.ended(self.model, carry.memory, self._state(obs), noise[: self.termination.noise_size])
+        state = self._state(obs, carry.view)
+        return self.termination.ended(self.model, carry.memory, state, noise[: self.termination.noise_size])
 
     def _action(self, output: Float[Array, " A"], noise: Array) -> Float[Array, " A"]:
         discrete = self.model.networks.discrete
@@ -137,9 +147,10 @@ class OptionExecutor(struct.PyTreeNode):
             output = output + self.std * (gumbel(noise) if discrete else noise)
         return one_hot_of(output) if discrete else jnp.clip(output, -1.0, 1.0)
 
-    def _state(self, obs: Float[Array, " S"]) -> Float[Array, " P"]:
-        """Return the proprioceptive slice: an observation may have more entries than the model reads."""
-        return obs[: self.model.state_size]
+    def _state(self, obs: Float[Array, " S"], view: Any) -> Float[Array, " P"]:
+        """Return the proprioceptive slice, in a view: an observation may have more entries than the model reads."""
+        state = obs[: self.model.state_size]
+        return state if view is None else self.model.views.obs(view, state)
 
     def _decoder(self, *args: Any, method: str) -> Any:
         return apply(self.model.networks.decoder, self.model.params["decoder"], *args, method=method)

@@ -184,7 +184,7 @@ class OptionModel(struct.PyTreeNode):
     """E, D, P and F with their parameters, and the scales of states and state changes.
 
     `delta` [] is the error of P at which termination predict ends an option. `book` [M, D] are the codes of discrete
-    options, None without `options.codes`.
+    options, None without `options.codes`. `views` are those of the body if an option chooses its own, else None.
     """
 
     params: dict
@@ -193,6 +193,7 @@ class OptionModel(struct.PyTreeNode):
     delta: Array
     networks: Networks = struct.field(pytree_node=False)
     book: Any = None
+    views: Any = None
 
     @property
     def state_size(self) -> int:

@@ -151,7 +151,10 @@ def refit(
     Returns the model and the losses of every step.
     """
     key_start, key_run, key_steps = jax.random.split(key, 3)
-    env, executor = AutoReset(env), make_executor(dataclasses.replace(options, termination="fixed"), model)
+    env, executor = (
+        AutoReset(env),
+        make_executor(dataclasses.replace(options, termination="fixed"), model.replace(views=None)),
+    )
     begin = start(env, executor, REFIT_ENVS, key_start)
     ticks = REFIT_OPTIONS * options.length
     _, run = rollout(env, executor, lambda obs, noise: (noise, jnp.zeros(len(obs))), begin, key_run, ticks)
