@@ -168,6 +168,8 @@ class PractiseConfig:
     """Budget of interactions per seed; 0 leaves D as learnt."""
     hold: int = 3
     """Most options for which a code from the prior is held."""
+    speed: Positive = 1.5
+    """Speed in m/s in a code's direction beyond which more earns nothing: fast ants fall."""
     control_cost: float = 0.1
     """Weight of |action|^2 in the reward."""
     upright: float = 1.0

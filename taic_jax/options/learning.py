@@ -232,7 +232,8 @@ def learn(
     """
     if (config.views == "all" or config.choose_view) and views is None:
         raise ValueError(
-            "options.views: all and options.choose_view need the views of the body, as in learn(..., views=env.views); got none"
+            "options.views: all and options.choose_view need the views of the body, as in learn(..., views=env.views); "
+            "got none"
         )
     config = as_arrays(config)
     dataset = make_dataset(experience, config, views, make_frame(config, heading))

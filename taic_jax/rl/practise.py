@@ -45,8 +45,8 @@ class PracticeState(struct.PyTreeNode):
 class Practising(Wrapper):
     """A task whose observation is D's input: the state that D sees, a code from the prior, and the share of its ticks.
 
-    The reward of a tick is the speed in m/s in the code's direction, seen from the heading, less half the speed across
-    it and the control cost, plus the upward part of the body's own axis. Episodes end as those of the inner task, which
+    The reward of a tick is the speed in m/s in the code's direction, seen from the heading and up to `speed`, less half
+    the speed across it and the control cost, plus the upward part of the body's own axis. Episodes end as those of the inner task, which
     resets itself: what resets a batch under `vmap` may not read a model of its own in each row.
     """
 
@@ -109,7 +109,7 @@ class Practising(Wrapper):
         across = jnp.abs(velocity[0] * before.direction[1] - velocity[1] * before.direction[0])
         at = frame.heading.quaternion
         upright = 1 - 2 * (state[at + 1] ** 2 + state[at + 2] ** 2)
-        reward = along - 0.5 * across + self.config.upright * upright
+        reward = jnp.minimum(along, self.config.speed) - 0.5 * across + self.config.upright * upright
         reward -= self.config.control_cost * jnp.sum(action**2)
         return reward, dict(zip(METRICS, (along, across, upright), strict=True))
 

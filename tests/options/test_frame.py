@@ -93,10 +93,10 @@ def test_the_way_is_where_the_body_went(walks):
     assert ways.shape == (len(angles), TICKS - 1, 2)
     gone = place[0, 1:] - place[0, :1]
     yaw = 2 * np.arctan2(obs[0, 0, 4], obs[0, 0, 1])
-    np.testing.assert_allclose(ways[0], jax.vmap(partial(rotated, angle=-yaw))(gone), atol=0.2)
-    assert np.abs(gone[-1]).max() > 0.4
+    np.testing.assert_allclose(ways[0], jax.vmap(partial(rotated, angle=-yaw))(gone), atol=0.3)
+    assert np.abs(gone[-1]).max() > 2.0
     world = Frame(env.heading, turns=False, weight=1)
-    np.testing.assert_allclose(world.changes(obs[1])[:, -2:], place[1, 1:] - place[1, :1], atol=0.2)
+    np.testing.assert_allclose(world.changes(obs[1])[:, -2:], place[1, 1:] - place[1, :1], atol=0.3)
 
 
 @pytest.fixture(scope="module")

@@ -27,7 +27,7 @@ OPTIONS = as_arrays(OptionsConfig(
     frame="heading", way_weight=2, learning_rate=3e-3,
 ))  # fmt: skip
 PRACTICE = PractiseConfig(
-    ticks=30_000, hold=HOLD, refit_steps=300,
+    ticks=30_000, hold=HOLD, speed=0.8, refit_steps=300,
     ppo=PPOConfig(num_envs=16, rollout_length=32, minibatch_size=128, log_std_init=-0.5, learning_rate=1e-2),
 )  # fmt: skip
 
@@ -62,8 +62,11 @@ SLED = TimeLimit(Sled(), 50)
 
 @pytest.fixture(scope="module")
 def model():
+    """A model whose D acts within bounds, and whose P leads opposite codes opposite ways."""
     model = random_model(OPTIONS, 6, 2, Sled.heading)
-    return model.replace(params=jax.tree.map(lambda x: 0.3 * x, model.params))  # so that D's actions are within bounds
+    params = jax.tree.map(lambda x: 0.3 * x, model.params)
+    params["predictor"] = jax.tree.map(lambda x: x if x.ndim == 2 else 0.0 * x, model.params["predictor"])
+    return model.replace(params=params, change_scale=model.change_scale.replace(mean=jnp.zeros(8)))
 
 
 @pytest.fixture(scope="module")
@@ -125,7 +128,7 @@ def test_the_reward_is_of_the_speed_in_the_codes_direction(model, walk):
     np.testing.assert_allclose(directions[3, 3], way[-2:] / np.linalg.norm(way[-2:]), atol=1e-5)
     along = jnp.sum(actions * directions, axis=-1)  # the sled's own frame is the heading's
     across = jnp.abs(actions[..., 0] * directions[..., 1] - actions[..., 1] * directions[..., 0])
-    expected = along - 0.5 * across + 1.0 - 0.1 * jnp.sum(actions**2, axis=-1)
+    expected = jnp.minimum(along, 0.8) - 0.5 * across + 1.0 - 0.1 * jnp.sum(actions**2, axis=-1)
     np.testing.assert_allclose(states.reward, expected, atol=1e-4)
 
 
@@ -151,25 +154,24 @@ def test_a_sled_learns_to_go_where_its_codes_say_and_keeps_its_other_networks(mo
     for _ in range(trainer.num_steps):
         state, metrics, _ = step(state)
         first = metrics if first is None else first
-    assert metrics["mean/speed_along"] > 0.8 > 0.4 > first["mean/speed_along"]
+    assert metrics["mean/speed_along"] > 0.5 > 0.2 > first["mean/speed_along"]
     np.testing.assert_allclose(state.obs_statistics.mean, 0.0, atol=1e-3)
     np.testing.assert_allclose(state.obs_statistics.std, 1.0, atol=1e-3)
     practised = model.with_decoder(practise.decoder_of(state.params.actor, model.params["decoder"]))
     refitted, losses = jax.jit(partial(practise.refit, OPTIONS, PRACTICE, SLED))(practised, jax.random.key(3))
     assert_trees_equal(refitted.params["decoder"], practised.params["decoder"])
-    windows, codes = executed(refitted)
-    means = jax.vmap(refitted.encode)(windows)[0][:, -1]
-    assert np.corrcoef(np.ravel(means), np.ravel(codes))[0, 1] > 0.9, "E reads the code from the actions"
+    assert read(refitted) > 0.6 > 0.4 > read(practised), "E reads the code from the actions, but not how long it is"
     assert np.mean(losses["prediction_loss"][-20:]) < 0.5 * np.mean(losses["prediction_loss"][:20])
 
 
-def executed(model):
-    """Return the actions [N, L, A] of codes [N, D]."""
+def read(model):
+    """Return the correlation of codes with E's means of the actions that they give."""
     env, executor = AutoReset(SLED), make_executor(OPTIONS, model)
     begin = start(env, executor, 64, jax.random.key(7))
     codes = jax.random.normal(jax.random.key(8), (64, 2))
     _, ticks = rollout(env, executor, lambda obs, noise: (codes, jnp.zeros(64)), begin, jax.random.key(9), L)
-    return jnp.swapaxes(ticks.action, 0, 1), codes
+    means = jax.vmap(model.encode)(jnp.swapaxes(ticks.action, 0, 1))[0][:, -1]
+    return np.corrcoef(np.ravel(means), np.ravel(codes))[0, 1]
 
 
 VALID = {"options__decoder": "closed", "options__frame": "heading", "options__way_weight": 8, "practise__ticks": 16}
