@@ -46,8 +46,8 @@ class Practising(Wrapper):
     """A task whose observation is D's input: the state that D sees, a code from the prior, and the share of its ticks.
 
     The reward of a tick is the speed in m/s in the code's direction, seen from the heading and up to `speed`, less half
-    the speed across it and the control cost, plus the upward part of the body's own axis. Episodes end as those of the inner task, which
-    resets itself: what resets a batch under `vmap` may not read a model of its own in each row.
+    the speed across it and the control cost, plus the upward part of the body's own axis. Episodes end as those of the
+    inner task, which resets itself: what resets a batch under `vmap` may not read a model of its own in each row.
     """
 
     def __init__(self, env: Env, options: OptionsConfig, config: PractiseConfig, model: OptionModel):
