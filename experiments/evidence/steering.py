@@ -35,7 +35,7 @@ from taic_jax.experiments.evidence.navigate import (
     straight,
 )
 from taic_jax.experiments.evidence.table import RESULTS, with_interval, write_numbers
-from taic_jax.experiments.figures.navigation import draw_navigation
+from taic_jax.experiments.evidence.ways import draw_navigation
 from taic_jax.options.execution import Executor, OptionExecutor, make_executor
 from taic_jax.pipeline import make_envs
 from taic_jax.rl.rollout import RolloutCarry, rollout, start

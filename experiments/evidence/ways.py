@@ -11,20 +11,19 @@ from matplotlib.patches import Circle, Rectangle
 from taic_jax.envs.ant_tasks import SUCCESS_RADIUS
 from taic_jax.envs.arenas import Arena
 from taic_jax.experiments.evidence.navigate import Compass
-from taic_jax.experiments.figures.drawing import BLUE, GREEN, GREY, RED, styled
 
 PATHS = 32
+BLUE, RED, GREEN, GREY = "#0072b2", "#d55e00", "#009e73", "#8c8c8c"  # Okabe and Ito's
 
 
-@styled
 def draw_navigation(compass: Compass, paths: Mapping[str, tuple[Arena, np.ndarray, float]], out: Path) -> None:
     """Draw codes and, for each arena by name, the paths [T, B, 2] of ants and their success; write a PNG."""
-    figure, panels = plt.subplots(1, 1 + len(paths), figsize=(4 * (1 + len(paths)), 4.2))
+    figure, panels = plt.subplots(1, 1 + len(paths), figsize=(4 * (1 + len(paths)), 4.2), layout="constrained")
     _draw_rose(panels[0], compass)
     for axes, (name, (arena, places, success)) in zip(panels[1:], paths.items(), strict=True):
         _draw_arena(axes, arena, places[:, :PATHS])
         axes.set_title(f"{name}: {success:.0%} at the goal")
-    figure.savefig(out)
+    figure.savefig(out, dpi=90)
     plt.close(figure)
 
 
@@ -46,9 +45,8 @@ def _draw_arena(axes: Axes, arena: Arena, places: np.ndarray) -> None:
         axes.add_patch(Rectangle((x, y), right - x, top - y, color=GREY))
     if arena.block:
         (x, y, _), (half_x, half_y, _) = arena.block.centre, arena.block.half
-        axes.add_patch(
-            Rectangle((x - half_x, y - half_y), 2 * half_x, 2 * half_y, fill=False, hatch="//", edgecolor=GREY)
-        )
+        corner = x - half_x, y - half_y
+        axes.add_patch(Rectangle(corner, 2 * half_x, 2 * half_y, fill=False, hatch="//", edgecolor=GREY))
     axes.add_patch(Circle(arena.goal[:2], SUCCESS_RADIUS, color=GREEN, alpha=0.25))
     axes.plot(*np.moveaxis(places, -1, 0), color=BLUE, linewidth=0.6, alpha=0.7)
     axes.plot(*np.moveaxis(places[-1], -1, 0), "o", color=RED, markersize=3)
