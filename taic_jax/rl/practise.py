@@ -6,6 +6,7 @@ before: the way that P predicts from the mean state.
 """
 
 import dataclasses
+from functools import partial
 from typing import Any
 
 import jax
@@ -28,6 +29,7 @@ from taic_jax.rl.rollout import rollout, start
 METRICS = ("speed_along", "speed_across", "upright")
 REFIT_ENVS, REFIT_OPTIONS = 64, 40
 """Environments, and options in each, from which E and P are refitted."""
+GAIN_CODES = 256
 
 
 class PracticeState(struct.PyTreeNode):
@@ -37,6 +39,7 @@ class PracticeState(struct.PyTreeNode):
     obs: Array
     code: Array  # [D]
     direction: Array  # [2] seen from the heading, of length 1
+    view: Array  # [] int32, in which D sees the state and acts; 0 if options do not choose it
     left: Array  # [] int32, options for which the code is still held
     tick: Array  # [] int32, within the option
     key: Array
@@ -52,7 +55,7 @@ class Practising(Wrapper):
 
     def __init__(self, env: Env, options: OptionsConfig, config: PractiseConfig, model: OptionModel):
         super().__init__(AutoReset(env))
-        self.model, self.options, self.config = model, options, config
+        self.model, self.options, self.config, self.gain = model, options, config, gain(model, options.size)
         self.name = f"practice of {env.name}"
         self.observation_size = self.proprioceptive_size = model.state_size + options.size + 1
 
@@ -61,7 +64,7 @@ class Practising(Wrapper):
         key_inner, key = jax.random.split(key)
         zero, nothing = jnp.zeros((), jnp.int32), jnp.zeros(self.options.size)
         inner = self.env.reset(key_inner)
-        practice = PracticeState(inner, jnp.zeros(self.observation_size), nothing, jnp.zeros(2), zero, zero, key)
+        practice = PracticeState(inner, jnp.zeros(self.observation_size), nothing, jnp.zeros(2), zero, zero, zero, key)
         practice = self._draw(practice)
         return State.first(practice, practice.obs, dict.fromkeys(METRICS, jnp.zeros(())))
 
@@ -72,8 +75,9 @@ class Practising(Wrapper):
     def step(self, state: State, action: Float[Array, " A"]) -> State:
         """Act in the inner task; at its end, or that of a code's last option, draw another code."""
         before: PracticeState = state.physics
-        inner = self.env.step(before.inner, action)
-        reward, metrics = self._judge(before, inner.final_obs[: self.model.state_size], action)
+        views = self.model.views
+        inner = self.env.step(before.inner, views.action(views.back(before.view), action) if views else action)
+        reward, metrics = self._judge(before, self._state(before, inner.final_obs), action)
         tick = before.tick + 1
         ended = tick >= self.options.length
         left = before.left - ended.astype(jnp.int32)
@@ -88,22 +92,30 @@ class Practising(Wrapper):
 
     def _draw(self, practice: PracticeState) -> PracticeState:
         """Begin an option of another code."""
-        key, key_code, key_left = jax.random.split(practice.key, 3)
+        key, key_code, key_left, key_view = jax.random.split(practice.key, 4)
         code = jax.random.normal(key_code, (self.options.size,))
+        count = len(self.model.views) if self.model.views else 1
         left, tick = jax.random.randint(key_left, (), 1, self.config.hold + 1), jnp.zeros((), jnp.int32)
-        practice = practice.replace(code=code, direction=direction(self.model, code), left=left, tick=tick, key=key)
+        practice = practice.replace(
+            code=code, direction=direction(self.model, self.gain, code), left=left, tick=tick, key=key,
+            view=jax.random.randint(key_view, (), 0, count),
+        )  # fmt: skip
         return practice.replace(obs=self._observe(practice, practice.inner.obs))
 
     def _observe(self, practice: PracticeState, obs: Float[Array, " I"]) -> Float[Array, " S"]:
-        state = obs[: self.model.state_size]
+        state = self._state(practice, obs)
         share = practice.tick.astype(jnp.float32) / self.options.length
         return jnp.concatenate([self.model.see(state, state), practice.code, share[None]])
+
+    def _state(self, practice: PracticeState, obs: Float[Array, " I"]) -> Float[Array, " P"]:
+        state = obs[: self.model.state_size]
+        return self.model.views.obs(practice.view, state) if self.model.views else state
 
     def _judge(
         self, before: PracticeState, state: Float[Array, " P"], action: Float[Array, " A"]
     ) -> tuple[Array, dict[str, Array]]:
         frame: Any = self.model.networks.frame
-        first = before.inner.obs[: self.model.state_size]
+        first = self._state(before, before.inner.obs)
         velocity = frame.way(state, first) / self.dt
         along = velocity @ before.direction
         across = jnp.abs(velocity[0] * before.direction[1] - velocity[1] * before.direction[0])
@@ -114,10 +126,21 @@ class Practising(Wrapper):
         return reward, dict(zip(METRICS, (along, across, upright), strict=True))
 
 
-def direction(model: OptionModel, code: Float[Array, " D"]) -> Float[Array, " 2"]:
-    """Return where a code leads by P from the mean state, seen from the heading; of length 1."""
-    predicted = model.predict(jnp.zeros(model.state_size), code)
-    way = (predicted * model.change_scale.std + model.change_scale.mean)[-2:]
+def gain(model: OptionModel, size: int) -> Float[Array, " 2"]:
+    """Return the factor by which ways in the experience differ more than those that P predicts of codes."""
+    codes = jax.random.normal(jax.random.key(0), (GAIN_CODES, size))
+    predicted = jax.vmap(partial(model.predict, jnp.zeros(model.state_size)))(codes)[:, -2:]
+    weight: Any = model.networks.frame
+    return jnp.sqrt(float(weight.weight)) / jnp.maximum(jnp.std(predicted, axis=0), 1e-3)
+
+
+def direction(model: OptionModel, gain: Float[Array, " 2"], code: Float[Array, " D"]) -> Float[Array, " 2"]:
+    """Return where a code leads by P from the mean state, seen from the heading; of length 1.
+
+    Codes shall lead as far apart as the body went in the experience: P, a mean, knows less.
+    """
+    predicted = model.predict(jnp.zeros(model.state_size), code)[-2:]
+    way = gain * predicted * model.change_scale.std[-2:] + model.change_scale.mean[-2:]
     return way / jnp.maximum(jnp.linalg.norm(way), 1e-6)
 
 
