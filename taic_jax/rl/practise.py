@@ -29,7 +29,7 @@ from taic_jax.rl.rollout import rollout, start
 METRICS = ("speed_along", "speed_across", "upright")
 REFIT_ENVS, REFIT_OPTIONS = 64, 40
 """Environments, and options in each, from which E and P are refitted."""
-GAIN_CODES = 256
+WIDENING_CODES = 256
 
 
 class PracticeState(struct.PyTreeNode):
@@ -55,7 +55,7 @@ class Practising(Wrapper):
 
     def __init__(self, env: Env, options: OptionsConfig, config: PractiseConfig, model: OptionModel):
         super().__init__(AutoReset(env))
-        self.model, self.options, self.config, self.gain = model, options, config, gain(model, options.size)
+        self.model, self.options, self.config = model, options, config
         self.name = f"practice of {env.name}"
         self.observation_size = self.proprioceptive_size = model.state_size + options.size + 1
 
@@ -97,7 +97,7 @@ class Practising(Wrapper):
         count = len(self.model.views) if self.model.views else 1
         left, tick = jax.random.randint(key_left, (), 1, self.config.hold + 1), jnp.zeros((), jnp.int32)
         practice = practice.replace(
-            code=code, direction=direction(self.model, self.gain, code), left=left, tick=tick, key=key,
+            code=code, direction=direction(self.model, code), left=left, tick=tick, key=key,
             view=jax.random.randint(key_view, (), 0, count),
         )  # fmt: skip
         return practice.replace(obs=self._observe(practice, practice.inner.obs))
@@ -126,21 +126,19 @@ class Practising(Wrapper):
         return reward, dict(zip(METRICS, (along, across, upright), strict=True))
 
 
-def gain(model: OptionModel, size: int) -> Float[Array, " 2"]:
-    """Return the factor by which ways in the experience differ more than those that P predicts of codes."""
-    codes = jax.random.normal(jax.random.key(0), (GAIN_CODES, size))
+def widened(model: OptionModel) -> OptionModel:
+    """Return a model by whose P codes lead as far apart as the body went in the experience: P, a mean, knows less."""
+    codes = jax.random.normal(jax.random.key(0), (WIDENING_CODES, model.networks.encoder.option_size))
     predicted = jax.vmap(partial(model.predict, jnp.zeros(model.state_size)))(codes)[:, -2:]
-    weight: Any = model.networks.frame
-    return jnp.sqrt(float(weight.weight)) / jnp.maximum(jnp.std(predicted, axis=0), 1e-3)
+    frame: Any = model.networks.frame
+    gain = jnp.sqrt(float(frame.weight)) / jnp.maximum(jnp.std(predicted, axis=0), 1e-3)
+    return model.replace(change_scale=model.change_scale.replace(std=model.change_scale.std.at[-2:].multiply(gain)))
 
 
-def direction(model: OptionModel, gain: Float[Array, " 2"], code: Float[Array, " D"]) -> Float[Array, " 2"]:
-    """Return where a code leads by P from the mean state, seen from the heading; of length 1.
-
-    Codes shall lead as far apart as the body went in the experience: P, a mean, knows less.
-    """
-    predicted = model.predict(jnp.zeros(model.state_size), code)[-2:]
-    way = gain * predicted * model.change_scale.std[-2:] + model.change_scale.mean[-2:]
+def direction(model: OptionModel, code: Float[Array, " D"]) -> Float[Array, " 2"]:
+    """Return where a code leads by P from the mean state, seen from the heading; of length 1."""
+    predicted = model.predict(jnp.zeros(model.state_size), code)
+    way = (predicted * model.change_scale.std + model.change_scale.mean)[-2:]
     return way / jnp.maximum(jnp.linalg.norm(way), 1e-6)
 
 

@@ -121,18 +121,24 @@ def test_d_becomes_the_actor_and_the_actor_d(task, model):
 def test_the_reward_is_of_the_speed_in_the_codes_direction(model, walk):
     actions, first, states = walk
     before = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b[:-1]]), first.physics, states.physics)
-    gain = practise.gain(model, 2)
-    directions = jax.vmap(jax.vmap(partial(practise.direction, model, gain)))(before.code)
+    directions = jax.vmap(jax.vmap(partial(practise.direction, model)))(before.code)
     np.testing.assert_allclose(directions, before.direction, atol=1e-5)
     np.testing.assert_allclose(np.linalg.norm(directions, axis=-1), 1.0, atol=1e-5)
-    predicted = jax.vmap(partial(model.predict, jnp.zeros(6)))(jax.random.normal(jax.random.key(5), (4000, 2)))[:, -2:]
-    np.testing.assert_allclose(gain * predicted.std(axis=0), np.sqrt(2.0), rtol=0.15)  # the way's weight is 2
-    way = gain * model.predict(jnp.zeros(6), before.code[3, 3])[-2:] * model.change_scale.std[-2:]
+    way = model.predict(jnp.zeros(6), before.code[3, 3])[-2:] * model.change_scale.std[-2:]
     np.testing.assert_allclose(directions[3, 3], way / np.linalg.norm(way), atol=1e-5)
     along = jnp.sum(actions * directions, axis=-1)  # the sled's own frame is the heading's
     across = jnp.abs(actions[..., 0] * directions[..., 1] - actions[..., 1] * directions[..., 0])
     expected = jnp.minimum(along, 0.8) - 0.5 * across + 1.0 - 0.1 * jnp.sum(actions**2, axis=-1)
     np.testing.assert_allclose(states.reward, expected, atol=1e-4)
+
+
+def test_codes_lead_as_far_apart_as_the_body_went(model):
+    codes = jax.random.normal(jax.random.key(5), (4000, 2))
+    wide = practise.widened(model)
+    predicted = jax.vmap(partial(wide.predict, jnp.zeros(6)))(codes) * wide.change_scale.std
+    went = model.change_scale.std * np.sqrt(OPTIONS.way_weight)  # by its weight the way has a smaller scale
+    np.testing.assert_allclose(predicted.std(axis=0)[-2:], went[-2:], rtol=0.15)
+    np.testing.assert_array_equal(wide.change_scale.std[:-2], model.change_scale.std[:-2])
 
 
 def test_codes_are_held_for_whole_options_and_end_with_episodes(walk):
