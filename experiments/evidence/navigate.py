@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Bool, Float, Key
 
 from taic_jax.analysis.option_space import always
 from taic_jax.envs.ant_tasks import SUCCESS_RADIUS, upside_down
@@ -116,15 +116,19 @@ def measures_of(ticks: Rollout, dt: float) -> dict[str, float]:
     """Return the measures of navigated episodes."""
     metrics, place = jax.device_get(ticks.extras)
     over = metrics["upside_down"] > 0.5
-    onsets = over[1:] & ~over[:-1]
     return {
         "success": float((metrics["distance"][-1] < SUCCESS_RADIUS).mean()),
         "ever": float((metrics["closest_approach"][-1] < SUCCESS_RADIUS).mean()),
         "final_distance": float(metrics["distance"][-1].mean()),
         "speed": float(np.linalg.norm(place[20:] - place[:-20], axis=-1)[~over[20:]].mean() / (20 * dt)),
-        "overturned_per_1000": float(1000 * onsets.sum() / over.size),
+        "overturned_per_1000": onsets_per_1000(over),
         "overturned": float(over[-1].mean()),
     }
+
+
+def onsets_per_1000(flag: Bool[np.ndarray, "T B"]) -> float:
+    """Return how often in 1000 ticks a flag rises."""
+    return float(1000 * (flag[1:] & ~flag[:-1]).sum() / flag.size)
 
 
 def measures_of_codes(compass: Compass) -> dict[str, float]:

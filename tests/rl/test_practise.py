@@ -135,7 +135,7 @@ def test_the_reward_is_of_the_speed_in_the_codes_direction(model, walk):
 def test_codes_lead_as_far_apart_as_the_body_went(model):
     codes = jax.random.normal(jax.random.key(5), (4000, 2))
     wide = practise.widened(model)
-    predicted = jax.vmap(partial(wide.predict, jnp.zeros(6)))(codes) * wide.change_scale.std
+    predicted = jax.vmap(partial(wide.predict, jnp.zeros(6)))(codes) * wide.change_scale.std[None]
     went = model.change_scale.std * np.sqrt(OPTIONS.way_weight)  # by its weight the way has a smaller scale
     np.testing.assert_allclose(predicted.std(axis=0)[-2:], went[-2:], rtol=0.15)
     np.testing.assert_array_equal(wide.change_scale.std[:-2], model.change_scale.std[:-2])
