@@ -146,16 +146,17 @@ def measures_of_codes(compass: Compass) -> dict[str, float]:
 
 
 def straight(arena: Arena, speed: float, seconds: float) -> float:
-    """Return the distance from the goal in m of a point that goes straight to it, and stops at the first wall."""
+    """Return the distance from the goal in m of a point that goes straight to it, to the first wall or chasm."""
     goal = np.array(arena.goal[:2])
     steps = np.linspace(0, 1, 1000)[:, None] * min(speed * seconds / np.linalg.norm(goal), 1.0) * goal
-    solids = [*arena.solids]
+    boxes = [*arena.solids]
     if arena.block:
-        x, y, _ = arena.block.centre
-        half_x, half_y, _ = arena.block.half
-        solids.append((x - half_x, y - half_y, x + half_x, y + half_y))
-    blocked = np.zeros(len(steps), bool)
-    for a, b, c, d in solids if arena.ground < SOLID_HEIGHT else ():
-        blocked |= (steps[:, 0] > a) & (steps[:, 0] < c) & (steps[:, 1] > b) & (steps[:, 1] < d)
+        (x, y, _), (half_x, half_y, _) = arena.block.centre, arena.block.half
+        boxes.append((x - half_x, y - half_y, x + half_x, y + half_y))
+    within = np.zeros((len(boxes), len(steps)), bool)
+    for i, (a, b, c, d) in enumerate(boxes):
+        within[i] = (steps[:, 0] > a) & (steps[:, 0] < c) & (steps[:, 1] > b) & (steps[:, 1] < d)
+    on_platforms = arena.ground >= SOLID_HEIGHT  # there solids are the ground, and a chasm is between them
+    blocked = ~within[: len(arena.solids)].any(axis=0) if on_platforms else within.any(axis=0)
     last = np.argmax(blocked) - 1 if blocked.any() else len(steps) - 1
     return float(np.linalg.norm(goal - steps[last]))

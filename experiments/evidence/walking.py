@@ -3,8 +3,8 @@
 python -m taic_jax.experiments.evidence.walking RUN... --out FILE [--method collect]
 
 Each seed's policy walks with the noise of its training and without, in episodes that no fall ends, as in the arenas.
-`unhealthy_per_1000` counts how often in 1000 ticks the ant leaves its healthy state, by which its task ends, as by a hop
-above 1 m; `overturned_per_1000` how often it turns onto its back.
+`unhealthy_per_1000` counts how often in 1000 ticks the ant leaves its healthy state, by which its task ends, as by a
+hop above 1 m; `overturned_per_1000` how often it turns onto its back.
 """
 
 import dataclasses
