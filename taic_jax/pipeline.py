@@ -32,7 +32,7 @@ from taic_jax.options.dataset import Dataset, Experience, holds_out, make_datase
 from taic_jax.options.frame import make_frame
 from taic_jax.options.model import OptionModel
 from taic_jax.rl.agent import Agent
-from taic_jax.rl.practise import decoder_of, widened
+from taic_jax.rl.practise import decoder_of
 from taic_jax.runtime.devices import make_devices
 from taic_jax.runtime.driver import Run, drive
 from taic_jax.runtime.files import save_json
@@ -199,7 +199,7 @@ def learn(run: Run, env: Env) -> OptionModel:
 
 def practise(run: Run, env: Env, model: OptionModel) -> OptionModel:
     """Refine D of every seed's model, refit the other networks to it, and save the models in place of the learnt."""
-    params: Any = _train(run, env, PRACTISE, jax.vmap(widened)(model)).agent.params
+    params: Any = _train(run, env, PRACTISE, model).agent.params
     model = model.with_decoder(jax.vmap(decoder_of)(params.actor, model.params["decoder"]))
     args = run.config, model, run.stage_keys(PRACTISE)
     model, _ = _compile_rows(run, PRACTISE, partial(trainer.refit_rows, env), *args)(*args)

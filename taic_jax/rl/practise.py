@@ -7,7 +7,7 @@ before: the way that P predicts from the mean state.
 
 import dataclasses
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -29,7 +29,7 @@ from taic_jax.rl.rollout import rollout, start
 METRICS = ("speed_along", "speed_across", "upright")
 REFIT_ENVS, REFIT_OPTIONS = 64, 40
 """Environments, and options in each, from which E and P are refitted."""
-WIDENING_CODES = 256
+SECTOR_CODES = 256
 
 
 class PracticeState(struct.PyTreeNode):
@@ -39,6 +39,7 @@ class PracticeState(struct.PyTreeNode):
     obs: Array
     code: Array  # [D]
     direction: Array  # [2] seen from the heading, of length 1
+    sector: Any  # of all codes
     view: Array  # [] int32, in which D sees the state and acts; 0 if options do not choose it
     left: Array  # [] int32, options for which the code is still held
     tick: Array  # [] int32, within the option
@@ -64,8 +65,8 @@ class Practising(Wrapper):
         key_inner, key = jax.random.split(key)
         zero, nothing = jnp.zeros((), jnp.int32), jnp.zeros(self.options.size)
         inner = self.env.reset(key_inner)
-        practice = PracticeState(inner, jnp.zeros(self.observation_size), nothing, jnp.zeros(2), zero, zero, zero, key)
-        practice = self._draw(practice)
+        obs, sector = jnp.zeros(self.observation_size), sector_of(self.model)
+        practice = self._draw(PracticeState(inner, obs, nothing, jnp.zeros(2), sector, zero, zero, zero, key))
         return State.first(practice, practice.obs, dict.fromkeys(METRICS, jnp.zeros(())))
 
     def restart(self, key: Key[Array, ""], ended: PracticeState) -> State:
@@ -94,11 +95,10 @@ class Practising(Wrapper):
         """Begin an option of another code."""
         key, key_code, key_left, key_view = jax.random.split(practice.key, 4)
         code = jax.random.normal(key_code, (self.options.size,))
-        count = len(self.model.views) if self.model.views else 1
         left, tick = jax.random.randint(key_left, (), 1, self.config.hold + 1), jnp.zeros((), jnp.int32)
         practice = practice.replace(
-            code=code, direction=direction(self.model, code), left=left, tick=tick, key=key,
-            view=jax.random.randint(key_view, (), 0, count),
+            code=code, direction=direction(self.model, practice.sector, code), left=left, tick=tick, key=key,
+            view=jax.random.randint(key_view, (), 0, _sides(self.model)),
         )  # fmt: skip
         return practice.replace(obs=self._observe(practice, practice.inner.obs))
 
@@ -126,20 +126,46 @@ class Practising(Wrapper):
         return reward, dict(zip(METRICS, (along, across, upright), strict=True))
 
 
-def widened(model: OptionModel) -> OptionModel:
-    """Return a model by whose P codes lead as far apart as the body went in the experience: P, a mean, knows less."""
-    codes = jax.random.normal(jax.random.key(0), (WIDENING_CODES, model.networks.encoder.option_size))
-    predicted = jax.vmap(partial(model.predict, jnp.zeros(model.state_size)))(codes)[:, -2:]
-    frame: Any = model.networks.frame
-    gain = jnp.sqrt(float(frame.weight)) / jnp.maximum(jnp.std(predicted, axis=0), 1e-3)
-    return model.replace(change_scale=model.change_scale.replace(std=model.change_scale.std.at[-2:].multiply(gain)))
+class Sector(NamedTuple):
+    """The ways that P predicts of codes from the mean state, as angles: their mean and standard deviation in rad."""
+
+    middle: Array
+    spread: Array
 
 
-def direction(model: OptionModel, code: Float[Array, " D"]) -> Float[Array, " 2"]:
-    """Return where a code leads by P from the mean state, seen from the heading; of length 1."""
+def sector_of(model: OptionModel) -> Sector:
+    """Measure the sector over codes of the prior."""
+    codes = jax.random.normal(jax.random.key(0), (SECTOR_CODES, model.networks.encoder.option_size))
+    ways = jax.vmap(partial(predicted_way, model))(codes)
+    middle = jnp.arctan2(*jnp.mean(ways, axis=0)[::-1])
+    return Sector(middle, jnp.std(jax.vmap(partial(angle_from, middle))(ways)))
+
+
+def predicted_way(model: OptionModel, code: Float[Array, " D"]) -> Float[Array, " 2"]:
+    """Return the way in m of a code by P from the mean state, seen from the heading."""
     predicted = model.predict(jnp.zeros(model.state_size), code)
-    way = (predicted * model.change_scale.std + model.change_scale.mean)[-2:]
-    return way / jnp.maximum(jnp.linalg.norm(way), 1e-6)
+    return (predicted * model.change_scale.std + model.change_scale.mean)[-2:]
+
+
+def angle_from(middle: Float[Array, ""], way: Float[Array, " 2"]) -> Float[Array, ""]:
+    """Return the angle of a way to the left of the middle."""
+    c, s = jnp.cos(middle), jnp.sin(middle)
+    return jnp.arctan2(c * way[1] - s * way[0], c * way[0] + s * way[1])
+
+
+def direction(model: OptionModel, sector: Sector, code: Float[Array, " D"]) -> Float[Array, " 2"]:
+    """Return where a code shall lead, seen from the heading; of length 1.
+
+    Codes keep their order by P, and spread evenly over the part of the circle that one view has to cover: P, a mean,
+    predicts ways that differ less than they do, and an ant that turns to where it goes sees them all ahead.
+    """
+    share = jax.scipy.stats.norm.cdf(angle_from(sector.middle, predicted_way(model, code)) / sector.spread)
+    angle = sector.middle + jnp.pi / _sides(model) * (2.0 * share - 1.0)
+    return jnp.stack([jnp.cos(angle), jnp.sin(angle)])
+
+
+def _sides(model: OptionModel) -> int:
+    return len(model.views) if model.views else 1
 
 
 def settings(config: PractiseConfig, options: OptionsConfig) -> PPOConfig:

@@ -8,12 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from probes import NO, assert_trees_equal, random_model
+from scipy import stats
 from tiny_runs import CONFIG, PPO, with_fields
 
 from taic_jax.config import Config, ConfigError, OptionsConfig, PPOConfig, PractiseConfig
 from taic_jax.config.checks import validate
 from taic_jax.envs import AutoReset, Env, State, TimeLimit
 from taic_jax.envs.base import Heading
+from taic_jax.envs.views import one_view
 from taic_jax.options.execution import IdentityExecutor, make_executor
 from taic_jax.rl import ppo, practise
 from taic_jax.rl.practise import Practising
@@ -121,24 +123,31 @@ def test_d_becomes_the_actor_and_the_actor_d(task, model):
 def test_the_reward_is_of_the_speed_in_the_codes_direction(model, walk):
     actions, first, states = walk
     before = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b[:-1]]), first.physics, states.physics)
-    directions = jax.vmap(jax.vmap(partial(practise.direction, model)))(before.code)
+    sector = practise.sector_of(model)
+    directions = jax.vmap(jax.vmap(partial(practise.direction, model, sector)))(before.code)
     np.testing.assert_allclose(directions, before.direction, atol=1e-5)
     np.testing.assert_allclose(np.linalg.norm(directions, axis=-1), 1.0, atol=1e-5)
-    way = model.predict(jnp.zeros(6), before.code[3, 3])[-2:] * model.change_scale.std[-2:]
-    np.testing.assert_allclose(directions[3, 3], way / np.linalg.norm(way), atol=1e-5)
     along = jnp.sum(actions * directions, axis=-1)  # the sled's own frame is the heading's
     across = jnp.abs(actions[..., 0] * directions[..., 1] - actions[..., 1] * directions[..., 0])
     expected = jnp.minimum(along, 0.8) - 0.5 * across + 1.0 - 0.1 * jnp.sum(actions**2, axis=-1)
     np.testing.assert_allclose(states.reward, expected, atol=1e-4)
 
 
-def test_codes_lead_as_far_apart_as_the_body_went(model):
-    codes = jax.random.normal(jax.random.key(5), (4000, 2))
-    wide = practise.widened(model)
-    predicted = jax.vmap(partial(wide.predict, jnp.zeros(6)))(codes) * wide.change_scale.std[None]
-    went = model.change_scale.std * np.sqrt(OPTIONS.way_weight)  # by its weight the way has a smaller scale
-    np.testing.assert_allclose(predicted.std(axis=0)[-2:], went[-2:], rtol=0.15)
-    np.testing.assert_array_equal(wide.change_scale.std[:-2], model.change_scale.std[:-2])
+@pytest.mark.parametrize("sides", [1, 4])
+def test_directions_of_codes_spread_evenly_in_the_order_of_p(model, sides):
+    codes = jax.random.normal(jax.random.key(5), (2000, 2))
+    model = model.replace(views=one_view(6, 2, sides) if sides > 1 else None)
+    ways = np.asarray(jax.vmap(lambda o: model.predict(jnp.zeros(6), o))(codes) * model.change_scale.std[None])[:, -2:]
+    ways = ways + np.array([6.0, 2.0])  # all go roughly one way
+    model = model.replace(change_scale=model.change_scale.replace(mean=jnp.zeros(8).at[-2:].set(jnp.array([6.0, 2.0]))))
+    sector = practise.sector_of(model)
+    got = jax.vmap(partial(practise.direction, model, sector))(codes)
+    angles = np.arctan2(got[:, 1], got[:, 0]) - sector.middle
+    angles = (angles + np.pi) % (2 * np.pi) - np.pi
+    assert np.abs(angles).max() <= np.pi / sides + 1e-4
+    assert angles.std() == pytest.approx(np.pi / sides / np.sqrt(3), rel=0.15), "as of a uniform distribution"
+    expected = np.arctan2(ways[:, 1], ways[:, 0])
+    assert stats.spearmanr(angles, expected).statistic > 0.99
 
 
 def test_codes_are_held_for_whole_options_and_end_with_episodes(walk):
