@@ -30,7 +30,7 @@ class Views(struct.PyTreeNode):
 
     def back(self, view: Int[Array, ""]) -> Int[Array, ""]:
         """Return the view that undoes a view: all are turns by the same angle."""
-        return (len(self) - view) % len(self)
+        return jnp.where(view == 0, 0, len(self) - view)
 
     def obs(self, view: Int[Array, ""], obs: Float[Array, "*batch P"]) -> Float[Array, "*batch P"]:
         """Return proprioceptive slices in a view."""

@@ -17,6 +17,8 @@ from taic_jax.envs.errors import UnknownNameError
 from taic_jax.options.model import OptionModel
 from taic_jax.summary import replay_sizes
 
+SIDES = 4  # equal sides of a body whose options choose the view
+
 
 def make_envs(config: Config) -> tuple[Env, Env]:
     """Return the task and the environment of stage collect.
@@ -65,6 +67,9 @@ def _check_heading(config: Config, source: Env) -> None:
         if value != neutral and source.heading is None:
             got = f"{value} with {source.name}, which has none"
             raise impossible(f"options.{field}", got, "a body with a heading, as ant has", neutral)
+    if options.choose_view and len(source.views) != SIDES:
+        got = f"True with {source.name}, which has {len(source.views)}"
+        raise impossible("options.choose_view", got, f"a body with {SIDES} equal sides, as ant has", False)
 
 
 def _check_actions(config: Config, env: Env, source: Env) -> None:

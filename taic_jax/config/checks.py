@@ -4,7 +4,7 @@ import math
 from operator import ge, le
 from typing import Annotated, Any, get_args, get_origin
 
-from taic_jax.config import USUAL_BOUNDS, Config, OptionsConfig, field_types, impossible, walk
+from taic_jax.config import USUAL_BOUNDS, Config, field_types, impossible, walk
 
 REPLAYS = ("collect.sac", "collect.dqn", "train.sac", "train.dqn")
 
@@ -33,15 +33,26 @@ def validate(config: Config) -> None:
         expected = "0 with train.fine_tune.epochs, which changes D too"
         raise impossible("options.refresh_every", options.refresh_every, expected, 0)
     _check_learners(config)
-    if config.practise.ticks:
-        _check_practice(options)
+    _check_steering(config)
     if "transfer" in baselines and not options.source:
         expected = "with transfer a run with options and a flat policy"
         raise impossible("train.baselines", "none: add --options RUN", expected)
 
 
-def _check_practice(options: OptionsConfig) -> None:
-    """Check that codes of the options can be practised: D has to see the state, and codes have to say where they go."""
+def _check_steering(config: Config) -> None:
+    """Check that D stays as it is if options choose their view; and that codes can be practised: D has to see the
+    state, and codes have to say where they go."""
+    options = config.options
+    if options.choose_view:
+        changes = {
+            "train.fine_tune.epochs": config.train.fine_tune.epochs,
+            "options.refresh_every": options.refresh_every,
+        }
+        for name, value in (changes | {"options.codes": options.codes}).items():
+            if value:
+                raise impossible(name, value, "0 with options.choose_view", 0)
+    if not config.practise.ticks:
+        return
     for name, value, needed, why in (
         ("decoder", options.decoder, "closed", "since an open-loop D cannot react"),
         ("frame", options.frame, "heading", "from which a code's direction is seen"),

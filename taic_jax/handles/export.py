@@ -40,6 +40,11 @@ def main(args: Sequence[str] | None = None) -> int:
     return answer(args, PROGRAM, Command, execute)
 
 
+def _sees_heading(handle: "Handle") -> bool:
+    options = handle.config.options
+    return options.frame == "heading" or options.way_weight > 0 or options.choose_view
+
+
 def execute(command: Command, handle: "Handle") -> None:
     """Write the files, once all are known, and print their paths."""
     from taic_jax.artifacts.models import describe
@@ -48,6 +53,9 @@ def execute(command: Command, handle: "Handle") -> None:
 
     if not command.format:
         raise ConfigError(f"--format: expected some of {', '.join(FILES)}, got none")
+    if "npz" in command.format and command.method == TAIC and _sees_heading(handle):
+        expected = "jax or onnx for options that see the heading or choose the view, which layers alone do not tell"
+        raise ConfigError(f"--format: expected {expected}; got npz")
     files, function = export(agent_of(handle, command.method, "--method", command.seed), command.format)
     options = handle.config.options if command.method == TAIC else None
     about = {

@@ -17,9 +17,10 @@ from onnx import helper, numpy_helper
 OPSET, IR = 18, 8  # of 2022: any runtime since reads them
 # A primitive: its operator, the parameters that are further inputs, and those that are attributes.
 OPERATORS: dict[str, tuple[str, tuple[str, ...], dict[str, str]]] = {
-    **{name: (name.title(), (), {}) for name in ("add", "sub", "mul", "div", "max", "min", "exp", "tanh", "or")},
+    **{name: (name.title(), (), {}) for name in ("add", "sub", "mul", "div", "max", "min", "exp", "tanh", "or", "and",
+                                                  "abs", "neg", "sqrt")},
     "logistic": ("Sigmoid", (), {}), "eq": ("Equal", (), {}), "ge": ("GreaterOrEqual", (), {}),
-    "gt": ("Greater", (), {}), "squeeze": ("Squeeze", ("dimensions",), {}),
+    "gt": ("Greater", (), {}), "lt": ("Less", (), {}), "squeeze": ("Squeeze", ("dimensions",), {}),
     "reshape": ("Reshape", ("new_sizes",), {}), "slice": ("Slice", ("start_indices", "limit_indices"), {}),
     "split": ("Split", ("sizes",), {"axis": "axis"}), "concatenate": ("Concat", (), {"axis": "dimension"}),
 }  # fmt: skip
@@ -104,6 +105,13 @@ class _Graph:
                 return self.add("Cast", place, to=helper.np_dtype_to_tensor_dtype(params["index_dtype"]))
             case "iota" if len(params["shape"]) == 1:
                 return [self.constant(np.arange(*params["shape"]), params["dtype"])]
+            case "dynamic_slice":
+                sizes, axis = params["slice_sizes"], self.constant([0])
+                begin = self.add("Concat", [self.add("Unsqueeze", [x, axis])[0] for x in inputs[1:]], axis=0)
+                begin = self.add("Cast", begin, to=onnx.TensorProto.INT64)
+                return self.add("Slice", [inputs[0], *begin, *self.add("Add", [*begin, self.constant(sizes)])])
+            case "gather" if params["slice_sizes"] == (1,):  # of a vector, by indices [N, 1]
+                return self.add("Gather", [inputs[0], *self.add("Squeeze", [inputs[1], self.constant([1])])])
             case "stack":
                 rows = [self.add("Unsqueeze", [x, self.constant([params["axis"]])])[0] for x in inputs]
                 return self.add("Concat", rows, axis=params["axis"])

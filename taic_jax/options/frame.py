@@ -66,13 +66,13 @@ class Frame(NamedTuple):
             return x, y
         at = self.heading.quaternion
         half_c, half_s = _half_yaw(first[..., at], first[..., at + 3])
-        c, s = half_c**2 - half_s**2, 2 * half_c * half_s
+        c, s = jnp.square(half_c) - jnp.square(half_s), 2 * half_c * half_s
         return c * x + s * y, c * y - s * x
 
 
 def _half_yaw(w: Array, z: Array) -> tuple[Array, Array]:
     """Return cosine and sine of half the yaw: of the rotation about the vertical that is left without the tilt."""
-    norm = jnp.sqrt(w**2 + z**2 + 1e-12)  # it is zero for a body exactly on its back
+    norm = jnp.sqrt(jnp.square(w) + jnp.square(z) + 1e-12)  # it is zero for a body exactly on its back
     return w / norm, z / norm
 
 
