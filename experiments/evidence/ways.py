@@ -7,6 +7,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Circle, Rectangle
+from PIL import Image
 
 from taic_jax.envs.ant_tasks import SUCCESS_RADIUS
 from taic_jax.envs.arenas import Arena
@@ -25,6 +26,8 @@ def draw_navigation(compass: Compass, paths: Mapping[str, tuple[Arena, np.ndarra
         axes.set_title(f"{name}: {success:.0%} at the goal")
     figure.savefig(out, dpi=90)
     plt.close(figure)
+    with Image.open(out) as picture:
+        picture.convert("RGB").quantize(64).save(out, optimize=True)
 
 
 def _draw_rose(axes: Axes, compass: Compass) -> None:

@@ -32,21 +32,23 @@ def walks():
     first = jax.jit(env.reset)(jax.random.key(0))
     actions = jax.random.uniform(jax.random.key(1), (TICKS, 8), minval=-1.0)
 
-    def walk(angle):
-        physics = first.physics
-        qpos = physics.qpos.at[3:7].set(product(turn_of(angle), physics.qpos[3:7]))
-        qpos = qpos.at[:2].set(rotated(qpos[:2], angle))
-        qvel = physics.qvel.at[:2].set(rotated(physics.qvel[:2] + jnp.array([6.0, 3.0]), angle))
-        physics = physics.replace(qpos=qpos, qvel=qvel)
-        state = first.replace(physics=physics, obs=jnp.concatenate([qpos[2:], qvel]))
+    return env, angles, actions, *jax.jit(jax.vmap(partial(walk, env, first, actions)))(angles)
 
-        def tick(state, action):
-            after = env.step(state, action)
-            return after, (state.obs, state.physics.qpos[:2])
 
-        return jax.lax.scan(tick, state, actions)[1]
+def walk(env, first, actions, angle):
+    """Return the observations and places of a walk that starts turned by an angle."""
+    physics = first.physics
+    qpos = physics.qpos.at[3:7].set(product(turn_of(angle), physics.qpos[3:7]))
+    qpos = qpos.at[:2].set(rotated(qpos[:2], angle))
+    qvel = physics.qvel.at[:2].set(rotated(physics.qvel[:2] + jnp.array([6.0, 3.0]), angle))
+    physics = physics.replace(qpos=qpos, qvel=qvel)
+    state = first.replace(physics=physics, obs=jnp.concatenate([qpos[2:], qvel]))
 
-    return env, angles, actions, *jax.jit(jax.vmap(walk))(angles)
+    def tick(state, action):
+        after = env.step(state, action)
+        return after, (state.obs, state.physics.qpos[:2])
+
+    return jax.lax.scan(tick, state, actions)[1]
 
 
 def turn_of(angle):

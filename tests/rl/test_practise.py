@@ -2,24 +2,42 @@
 
 import dataclasses
 from functools import partial
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import NO, assert_trees_equal, random_model
+from probes import assert_trees_equal, numbers, random_model
 from scipy import stats
-from tiny_runs import CONFIG, PPO, with_fields
+from sled import Sled
+from tiny_runs import (
+    CONFIG,
+    PPO,
+    KilledError,
+    assert_same_arrays,
+    die,
+    last_state,
+    methods_of,
+    rows_of,
+    tiny_steps,
+    with_fields,
+)
 
+import taic_jax as taic
+from taic_jax.artifacts.models import load_options
 from taic_jax.config import Config, ConfigError, OptionsConfig, PPOConfig, PractiseConfig
 from taic_jax.config.checks import validate
-from taic_jax.envs import AutoReset, Env, State, TimeLimit
-from taic_jax.envs.base import Heading
+from taic_jax.envs import AutoReset, TimeLimit
 from taic_jax.envs.views import one_view
 from taic_jax.options.execution import IdentityExecutor, make_executor
+from taic_jax.report.curves import pretraining
+from taic_jax.report.runs import read_run
 from taic_jax.rl import ppo, practise
 from taic_jax.rl.practise import Practising
 from taic_jax.rl.rollout import rollout, start
+from taic_jax.runtime.checkpoint import Checkpoints
+from taic_jax.summary import plan
 from taic_jax.trainer import make_trainer
 from taic_jax.types import as_arrays
 
@@ -32,31 +50,6 @@ PRACTICE = PractiseConfig(
     ticks=30_000, hold=HOLD, speed=0.8, refit_steps=300,
     ppo=PPOConfig(num_envs=16, rollout_length=32, minibatch_size=128, log_std_init=-0.5, learning_rate=1e-2),
 )  # fmt: skip
-
-
-class Sled(Env):
-    """A sled that faces anywhere, whose action is its velocity in its own frame."""
-
-    name = proprioception = "sled"
-    observation_size = proprioceptive_size = 6
-    action_size = 2
-    episode_length, dt = 50, 0.5
-    heading = Heading(quaternion=0, velocity=4, dt=0.5)
-
-    def reset(self, key):
-        half = jax.random.uniform(key, (), minval=-3.1, maxval=3.1) / 2
-        obs = jnp.array([1.0, 0, 0, 0, 0, 0]).at[0].set(jnp.cos(half)).at[3].set(jnp.sin(half))
-        return State.first(obs, obs, {})
-
-    def step(self, state, action):
-        w, z = state.obs[0], state.obs[3]
-        c, s = w**2 - z**2, 2 * w * z
-        velocity = jnp.stack([c * action[0] - s * action[1], s * action[0] + c * action[1]])
-        obs = state.obs.at[4:].set(velocity)
-        return state.replace(physics=obs, obs=obs, terminated=NO, truncated=NO)
-
-    def render(self, physics, *, height=240, width=320):
-        raise NotImplementedError
 
 
 SLED = TimeLimit(Sled(), 50)
@@ -210,3 +203,48 @@ def test_what_cannot_be_practised_is_refused(fields, message):
     with pytest.raises(ConfigError) as error:
         validate(with_fields(config, **fields))
     assert message in str(error.value)
+
+
+RUN = with_fields(
+    dataclasses.replace(CONFIG, practise=PractiseConfig(refit_steps=3, ppo=PPO)),
+    **VALID | {"practise__ticks": 40, "options__decoder_sizes": (4,)},
+    env__name=f"{Path(__file__).parents[1] / 'sled.py'}:Sled",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """Return the folder of a whole run."""
+    folder = tmp_path_factory.mktemp("practised")
+    with tiny_steps():
+        taic.run_pipeline(RUN, folder, quiet=True)
+    return folder
+
+
+def test_a_run_practises_between_learn_and_train(finished):
+    rows = rows_of(finished)
+    stages = list(dict.fromkeys(row["stage"] for row in rows if row["stage"] != "evaluate"))
+    assert stages == ["collect", "learn", "practise", "train"]
+    practised = [row for row in rows if row["stage"] == "practise"]
+    assert [row["ticks"] for row in practised] == [16, 32] and "practise/mean/speed_along" in practised[0]
+    env, learnt = taic.load(finished).env, last_state(finished, "learn")
+    model = load_options(finished / "options", env, RUN.options, 2)
+    for name in ("decoder", "encoder", "predictor", "estimator"):
+        for leaf in numbers(model.params[name]):
+            assert leaf.ndim < 3 or not any(np.array_equal(leaf, x) for x in learnt.values()), name
+    assert_trees_equal(taic.load(finished).options.rows.params, model.params)
+    lines = plan(RUN, env, env).splitlines()
+    assert "practise sled: 32 ticks x 2 seeds in 2 iterations" in lines
+    assert pretraining(read_run(finished), "train") == (80, [])
+
+
+def test_a_run_that_was_killed_in_practice_ends_as_a_whole_one(finished, tmp_path, monkeypatch):
+    with tiny_steps():
+        with pytest.raises(KilledError):
+            die(monkeypatch, Checkpoints, "save", 3 + 2 + 2)  # in the last step of practice
+            taic.run_pipeline(RUN, tmp_path, quiet=True)
+        monkeypatch.undo()
+        assert rows_of(tmp_path)[-1]["stage"] == "practise"
+        taic.run_pipeline(RUN, tmp_path, resume=True, quiet=True)
+    assert_same_arrays(*(last_state(folder, "train") for folder in (finished, tmp_path)))
+    assert rows_of(finished) == rows_of(tmp_path) and methods_of(finished) == methods_of(tmp_path)
