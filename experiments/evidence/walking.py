@@ -79,9 +79,7 @@ def write_measures(arguments: Arguments) -> None:
         config = RunFolder(folder).config()
         env: Any = make_envs(config)[1]
         if env.heading is None:
-            raise ConfigError(
-                f"{folder}: expected experience of a robot that can fall on its back, as ant, got {env.name}"
-            )
+            raise ConfigError(f"{folder}: expected a robot that can fall on its back, as ant, got {env.name}")
         agents = load_agents(folder / AGENTS / arguments.method)
         keys = [jax.random.key(config.seed + seed) for seed in range(config.seeds)]
         walks = [

@@ -12,7 +12,7 @@ from written_runs import write_options, write_run
 
 from taic_jax.envs import State
 from taic_jax.envs.base import PhysicsState
-from taic_jax.experiments.evidence import steering
+from taic_jax.experiments.evidence import navigate, steering
 
 
 class Sliding(Probe):
@@ -73,6 +73,22 @@ def test_options_of_real_ants_are_measured(tmp_path, monkeypatch):
     # In 0.3 s under actions at random it gets somewhere, but not far.
     assert all(0.001 < float(x) < 1 for x in rows["distance"]["per_seed"].split())
     assert float(rows["upside_down"]["iqm"]) < 0.2
+
+
+def test_ants_are_led_through_all_arenas(tmp_path, monkeypatch):
+    for name, value in {"CODES": 3, "STARTS": 2, "SECONDS": 0.3, "WARM_UP": 0.1, "EPISODES": 2}.items():
+        monkeypatch.setattr(navigate, name, value)
+    config = with_fields(CONFIG, env__name="ant")
+    run, out, picture = write_run(tmp_path / "run", config), tmp_path / "ways.csv", tmp_path / "ways.png"
+    write_options(run, config, experience=False)
+    assert steering.main([str(run), "--out", str(out), "--navigate", "--picture", str(picture)]) == 0
+    with out.open() as file:
+        rows = {(row["run"], row["measure"]): row for row in csv.DictReader(file)}
+    measured = {name.partition("/")[0] for run, name in rows if run.endswith("/run")}
+    assert measured == {"codes", "ant_maze", "ant_push", "ant_fall"} and picture.stat().st_size > 5000
+    stand, went = (float(rows[x, "ant_maze/final_distance"]["iqm"]) for x in ("stand", f"{tmp_path.name}/run"))
+    assert stand == 16 and abs(went - 16) < 4  # actions at random lead nowhere
+    assert all(len(row["per_seed"].split()) == 2 for (run, _), row in rows.items() if run.endswith("/run"))
 
 
 @pytest.mark.parametrize(
