@@ -98,11 +98,10 @@ class AntHeadings(Locomotion):
     def _judge(self, before: HeadingsState, after: HeadingsState, action: Float[Array, " A"]) -> Outcome:
         velocity = (after.qpos[:2] - before.qpos[:2]) / self.dt
         along, across = turned(velocity, -self._direction(before))
-        _, x, y, _ = after.qpos[3:7]
-        upright = 1 - 2 * (x**2 + y**2)
         control_cost = self.robot.control_cost * jnp.sum(action**2)
-        reward = along - 0.5 * jnp.abs(across) + upright - control_cost
-        return reward, {"speed_along": along, "speed_across": jnp.abs(across), "upright": upright}
+        reward = along - 0.5 * jnp.abs(across) + upright(after.qpos[3:7]) - control_cost
+        metrics = {"speed_along": along, "speed_across": jnp.abs(across), "upright": upright(after.qpos[3:7])}
+        return reward, metrics
 
 
 class ArenaState(PhysicsState):
@@ -256,10 +255,15 @@ def turned(vectors: Float[Array, "*batch 2"], angle: Float[Array, ""]) -> Float[
     return jnp.stack([c * x - s * y, s * x + c * y], axis=-1)
 
 
+def upright(quaternion: Float[Array, " 4"]) -> Float[Array, ""]:
+    """Return the upward part of the body's own z axis: 1 if it is level, and negative on its back."""
+    _, x, y, _ = quaternion
+    return 1 - 2 * (x**2 + y**2)
+
+
 def upside_down(quaternion: Float[Array, " 4"]) -> Bool[Array, ""]:
     """Return whether the body's own z axis points down."""
-    _, x, y, _ = quaternion
-    return x**2 + y**2 > 0.5
+    return upright(quaternion) < 0
 
 
 def wrapped(angle: Float[Array, "*batch"]) -> Float[Array, "*batch"]:

@@ -189,15 +189,15 @@ Row = tuple[Config, OptionModel | None]
 
 
 def make_trainer(stage: str, env: Env, config: Config, model: OptionModel | None = None) -> Trainer:
-    """Return the trainer of a stage: `collect`, `train` over a model's options, or one of `train.baselines`."""
-    if model is not None and stage != PRACTISE:
-        kind = RefreshTrainer if config.options.refresh_every else OptionTrainer
-        kind = FineTuneTrainer if config.train.fine_tune.epochs else kind
-        return kind(env, config, config.train.ticks, model=model)
+    """Return the trainer of a stage: `collect`, `practise` or `train` with a model, or one of `train.baselines`."""
     if stage == PRACTISE:
         assert model is not None
         task = Practising(env, config.options, config.practise, model)
         return PractiseTrainer(task, config, config.practise.ticks, model=model)
+    if model is not None:
+        kind = RefreshTrainer if config.options.refresh_every else OptionTrainer
+        kind = FineTuneTrainer if config.train.fine_tune.epochs else kind
+        return kind(env, config, config.train.ticks, model=model)
     ticks = {COLLECT: config.collect.ticks, "total": config.collect.ticks + config.train.ticks}
     hold = config.options.length if stage == "repeat" else 1
     return Trainer(env, config, ticks.get(stage, config.train.ticks), hold)

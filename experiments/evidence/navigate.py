@@ -132,16 +132,18 @@ def onsets_per_1000(flag: Bool[np.ndarray, "T B"]) -> float:
 
 
 def measures_of_codes(compass: Compass) -> dict[str, float]:
-    """Return the measures of a compass: medians of speed and agreement, and the share of starts overturned."""
+    """Return the measures of a compass: medians of speed and agreement, the share of starts overturned, and the widest
+    angle in degrees in which no fast and safe code leads."""
     speed, overturned = np.linalg.norm(compass.velocity, axis=-1), np.asarray(compass.overturned)
     angle = np.degrees(np.arctan2(compass.velocity[:, 1], compass.velocity[:, 0]))
     safe = (speed > 1.0) & (overturned < 0.1)
-    gaps = np.diff(np.sort(np.append(angle[safe], angle[safe].min(initial=0.0) + 360)))
+    ordered = np.sort(angle[safe])
+    gaps = np.diff(np.append(ordered, ordered[:1] + 360))
     return {
         "speed": float(np.median(speed)),
         "agreement": float(np.median(compass.agreement)),
         "overturned": float(overturned.mean()),
-        "widest_gap": float(gaps.max(initial=0.0)) if safe.any() else 360.0,  # degrees without a fast, safe code
+        "widest_gap": float(gaps.max(initial=0.0)) if safe.any() else 360.0,
     }
 
 
