@@ -11,7 +11,7 @@ from taic_jax.types import as_arrays
 def test_streams_of_stages_are_never_renumbered():
     assert STAGE_STREAMS == {
         "collect": 0, "learn": 1, "train": 2, "flat": 3, "evaluate": 4, "video": 5, "repeat": 6, "total": 7,
-        "transfer": 8,
+        "transfer": 8, "practise": 9,
     }  # fmt: skip
 
 
