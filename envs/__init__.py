@@ -64,8 +64,8 @@ _TASKS = {
     "ant_headings": _Task(AntHeadings, ("body",)),
     "ant_turn": _Task(partial(AntTurn, "ant_turn", ROBOTS["brax"]["ant"])),
     "ant_maze": _Task(partial(AntArena, "ant_maze", MAZE), ("body", "goal")),
-    "ant_push": _Task(partial(AntArena, "ant_push", PUSH), ("body",)),
-    "ant_fall": _Task(partial(AntArena, "ant_fall", FALL), ("body",)),
+    "ant_push": _Task(partial(AntArena, "ant_push", PUSH), ("body", "goal")),
+    "ant_fall": _Task(partial(AntArena, "ant_fall", FALL), ("body", "goal")),
 }
 _LIBRARIES = {  # prefix -> a task's constructor, which takes the name after it first
     BRAX_PREFIX: _Task(BraxEnv, ("pipeline",), has_engine=False),
@@ -100,7 +100,7 @@ def make_env(
       model: MJCF and rules of the running robots: `brax`, or `gym` for Gymnasium's own.
       body: of the ant, alone or in an arena: `gym`, or `hiro`, which is weaker and slower.
       contacts: of `ant` with the ground: `feet`, or `body`, as in the arenas.
-      goal: of the maze: `fixed`, `near`, or `uniform` while training.
+      goal: of an arena: `fixed`, `near` in the maze, or `uniform` while training.
       change_after: episodes after which the room of `nav2d` changes; 0 for never.
 
     Raises:

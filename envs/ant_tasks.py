@@ -3,6 +3,7 @@
 import copy
 import dataclasses
 import math
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +12,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, Key
 
-from taic_jax.envs.arenas import ANT_QPOS, ANT_QVEL, Arena, furnish
+from taic_jax.envs.arenas import ANT_QPOS, ANT_QVEL, Arena, furnish, is_open
 from taic_jax.envs.base import Goals, PhysicsState, State
 from taic_jax.envs.errors import UnknownNameError
 from taic_jax.envs.locomotion import Locomotion, Outcome
@@ -21,6 +22,8 @@ from taic_jax.envs.robots import ROBOTS, compile_spec, initial_qpos, load_spec, 
 SUCCESS_RADIUS = 5.0  # m, of HIRO
 # Ticks of one direction of `AntHeadings`, and its greatest angle to the x axis in rad: the body's views cover the rest.
 HOLD, SPREAD = 60, math.pi / 4
+PATIENCE = 40  # ticks on the back after which an arena cuts an episode of training
+GOALS = 16  # candidates for a random goal, of which the first is taken where an ant can be
 
 
 class TurningState(PhysicsState):
@@ -109,21 +112,22 @@ class ArenaState(PhysicsState):
 
     goal: Array  # [2] or [3] m
     closest: Array  # [] m, smallest distance to the goal so far
+    on_back: Array  # [] int32, ticks on the back without a break
 
 
 class AntArena(Locomotion):
     """Reach the goal of an arena: reward = -distance in m at each tick; only the time limit ends the episode.
 
     A fall does not: as every reward is negative, it would pay to fall. A simulation that diverges is truncated, not
-    terminated, in its last finite state.
+    terminated, in its last finite state; in training so is an ant that lies on its back.
 
     Observation: the 27 entries of `ant`, heights from the ground of the start, so that options learnt there apply; then
     the position [2], the way to the goal [2 or 3], and the way to a block [3].
 
     Args:
       body: of the ant, see `with_body`; options learnt on an `ant` of the same body apply.
-      goal: `fixed`; `near`, if the arena has one; or, as in HIRO's maze, `uniform` in the room in training and fixed in
-        evaluation.
+      goal: `fixed`; `near`, if the arena has one; or, as in HIRO's maze, `uniform` in training, over all places where
+        an ant can be, and fixed in evaluation.
 
     Raises:
       UnknownNameError: there is no such body or goal.
@@ -138,15 +142,16 @@ class AntArena(Locomotion):
         if goal == "near":
             arena = dataclasses.replace(arena, goal=arena.near_goal)
         self.arena, self.uniform_goal = arena, goal == "uniform"
+        self.patience: int | None = PATIENCE
         robot = with_contacts(with_body(ROBOTS["brax"]["ant"], body), "body")
         super().__init__(name, robot, backend, num_threads)
         self.proprioceptive_size = ANT_QPOS - robot.num_unobserved + ANT_QVEL
 
     @property
     def evaluated(self) -> "AntArena":
-        """This arena with its fixed goal."""
+        """This arena with its fixed goal, and whole episodes."""
         arena = copy.copy(self)
-        arena.uniform_goal = False
+        arena.uniform_goal, arena.patience = False, None
         return arena
 
     @property
@@ -172,14 +177,19 @@ class AntArena(Locomotion):
         if not self.uniform_goal:
             return state
         low, high = jnp.array(self.arena.room).reshape(2, 2)
-        physics = state.physics.replace(goal=jax.random.uniform(key_goal, (2,), minval=low, maxval=high))
+        places = jax.random.uniform(key_goal, (GOALS, 2), minval=low, maxval=high)
+        place = places[jnp.argmax(jax.vmap(partial(is_open, self.arena))(places))]
+        physics = state.physics.replace(goal=state.physics.goal.at[:2].set(place))
         physics = physics.replace(closest=self._distance(physics))
         return state.replace(physics=physics, obs=self._observe(physics))
 
     def step(self, state: State, action: Float[Array, " A"]) -> State:
         """Simulate one tick and measure the distance."""
         state = super().step(state, action)
-        return state.replace(terminated=jnp.zeros((), bool), truncated=state.terminated)
+        cut = state.terminated
+        if self.patience:
+            cut |= state.physics.on_back >= self.patience
+        return state.replace(terminated=jnp.zeros((), bool), truncated=cut)
 
     def render(self, physics: ArenaState, *, height: int = 240, width: int = 320) -> np.ndarray:
         """Draw the arena with MuJoCo's renderer, from above."""
@@ -204,11 +214,13 @@ class AntArena(Locomotion):
         """Take the noise from the block, and start the record of distances."""
         qpos = jnp.concatenate([physics.qpos[:ANT_QPOS], self._init_qpos[ANT_QPOS:]])
         qvel = physics.qvel.at[ANT_QVEL:].set(0.0)
-        start = ArenaState(qpos, qvel, physics.qacc_warmstart, goal=jnp.array(self.arena.goal), closest=jnp.zeros(()))
+        goal, closest, on_back = jnp.array(self.arena.goal), jnp.zeros(()), jnp.zeros((), jnp.int32)
+        start = ArenaState(qpos, qvel, physics.qacc_warmstart, goal, closest, on_back)
         return start.replace(closest=self._distance(start))
 
     def _advance(self, before: ArenaState, after: ArenaState) -> ArenaState:
-        return after.replace(closest=jnp.minimum(before.closest, self._distance(after)))
+        on_back = jnp.where(upside_down(after.qpos[3:7]), before.on_back + 1, 0)
+        return after.replace(closest=jnp.minimum(before.closest, self._distance(after)), on_back=on_back)
 
     def _distance(self, physics: ArenaState) -> Float[Array, ""]:
         return jnp.linalg.norm(physics.goal - physics.qpos[: physics.goal.shape[0]])

@@ -6,9 +6,11 @@ block. The outer walls are four planes, the cheapest shape for collisions, and s
 
 import dataclasses
 
+import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxtyping import Float
+from jax import Array
+from jaxtyping import Bool, Float
 
 from taic_jax.envs.robots import ANT_BIT
 
@@ -113,6 +115,13 @@ def furnish(spec: mujoco.MjSpec, arena: Arena) -> None:
     spec.worldbody.add_site(name="goal", pos=goal, size=[0.5] * 3, rgba=_GOAL)
     spec.body("torso").pos[2] += arena.ground
     _add_camera(spec, arena)
+
+
+def is_open(arena: Arena, place: Float[Array, " 2"]) -> Bool[Array, ""]:
+    """Return whether an ant can be at a place in the room: on a platform, or out of all solids."""
+    low, high = jnp.array(arena.solids).reshape(-1, 2, 2).swapaxes(0, 1)
+    within = jnp.any(jnp.all((low < place[None]) & (place[None] < high), axis=1))
+    return within if arena.ground else ~within
 
 
 def outside(arena: Arena, qpos: Float[np.ndarray, "*batch nq"]) -> int:

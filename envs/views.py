@@ -22,11 +22,12 @@ class Views(struct.PyTreeNode):
         """V."""
         return self.obs_order.shape[-2]
 
-    def nearest(self, direction: Float[Array, " 2"]) -> Int[Array, ""]:
-        """Return the view of four that a direction chooses: 0 along the first axis, then each a quarter turn on."""
+    def directions(self, direction: Float[Array, " 2"]) -> Float[Array, "V 2"]:
+        """Return a horizontal direction as each view sees it: equal sides lie around the vertical."""
         x, y = direction
-        along = jnp.where(x > 0.0, 0, 2)
-        return jnp.where(jnp.abs(x) >= jnp.abs(y), along, jnp.where(y > 0.0, 1, 3)).astype(jnp.int32)
+        angle = 2 * jnp.pi / len(self) * jnp.arange(len(self), dtype=jnp.float32)
+        c, s = jnp.cos(angle), jnp.sin(angle)
+        return jnp.stack([c * x - s * y, s * x + c * y], axis=-1)
 
     def back(self, view: Int[Array, ""]) -> Int[Array, ""]:
         """Return the view that undoes a view: all are turns by the same angle."""

@@ -191,7 +191,7 @@ def learn(run: Run, env: Env) -> OptionModel:
     if config.codes:
         book = _compile_rows(run, "learn", trainer.books_of_rows, config, state, dataset)(config, state, dataset)
         model = model.replace(book=book)
-    if config.choose_view:
+    if config.choose == "way":
         model = model.replace(views=jax.tree.map(lambda x: jnp.broadcast_to(x, (len(run.keys), *x.shape)), env.views))
     save_options(run.folder.path / OPTIONS, model, env, config)
     return model

@@ -67,9 +67,6 @@ def _check_heading(config: Config, source: Env) -> None:
         if value != neutral and source.heading is None:
             got = f"{value} with {source.name}, which has none"
             raise impossible(f"options.{field}", got, "a body with a heading, as ant has", neutral)
-    if options.choose_view and len(source.views) != SIDES:
-        got = f"True with {source.name}, which has {len(source.views)}"
-        raise impossible("options.choose_view", got, f"a body with {SIDES} equal sides, as ant has", False)
 
 
 def _check_actions(config: Config, env: Env, source: Env) -> None:

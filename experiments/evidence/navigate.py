@@ -94,13 +94,11 @@ def next_place(arena: Arena, place: Float[Array, "B 2"]) -> Float[Array, "B 2"]:
 def navigate(env: Any, executor: Executor, compass: Compass, frame: Frame | None, key: Key[Array, ""]) -> Rollout:
     """Return an episode each of several ants that the compass leads; the extras are metrics, and places [T, B, 2]."""
     size, turning = env.proprioceptive_size, Frame(env.heading, bool(frame and frame.turns), 1)
-    velocity = turning.heading.velocity
 
     def decide(obs: Array, noise: Array) -> tuple[Array, Array]:
         place = obs[:, size : size + 2]
         way = next_place(env.arena, place) - place
-        aimed = obs[:, :size].at[:, velocity : velocity + 2].set(way)  # turned as a velocity is
-        way = turning.way(aimed, aimed)
+        way = turning.turned(way, obs[:, :size])
         way = way / jnp.maximum(jnp.linalg.norm(way, axis=-1, keepdims=True), 1e-6)
         score = way @ compass.velocity.T - RISK * compass.overturned[None]
         return compass.codes[jnp.argmax(score, axis=1)], jnp.zeros(len(obs))

@@ -140,7 +140,7 @@ def navigation_of(folder: Path, picture: Path | None) -> tuple[int, dict[str, np
     rows = []
     for seed, executor in enumerate(executors):
         key_codes, key_run = jax.random.split(jax.random.key(config.seed + seed))
-        frame = executor.model.networks.frame
+        frame = None if executor.by_way else executor.model.networks.frame  # ways are in the world's axes
         compass = jax.device_get(measure_codes(ground, executor, frame, key_codes))
         ticks = {name: jax.device_get(navigate(env, executor, compass, frame, key_run)) for name, env in arenas.items()}
         measures = {"codes": measures_of_codes(compass)} | {

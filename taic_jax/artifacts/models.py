@@ -38,14 +38,14 @@ STRUCTURE = (
     "codes",
     "frame",
     "way_weight",
-    "choose_view",
+    "choose",
 )
 
 
 # What the first descriptions do not say, there being nothing else.
 EARLIER = {
     "learner": "ppo", "discrete": False, "heading": None, "options.codes": 0, "options.frame": "world",
-    "options.way_weight": 0, "options.choose_view": False, "sides": 1,
+    "options.way_weight": 0, "options.choose": "code", "sides": 1,
 }  # fmt: skip
 
 
@@ -173,7 +173,7 @@ def empty_model(env: Env | Body, config: OptionsConfig) -> OptionModel:
     changes = jnp.zeros(networks.predictor.change_size)
     book = jnp.zeros((config.codes, config.size)) if config.codes else None
     model = OptionModel(params, Scale(zeros, zeros), Scale(changes, changes), jnp.zeros(()), networks, book)
-    if not config.choose_view:
+    if config.choose != "way":
         return model
     count = describe(env)["sides"]
     return model.replace(views=one_view(env.proprioceptive_size, env.action_size, count))

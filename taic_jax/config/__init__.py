@@ -52,8 +52,8 @@ class EnvConfig:
     contacts: Literal["feet", "body"] = "feet"
     """Contacts of ant with the ground: those of its feet alone, or of its whole body, as in the arenas."""
     goal: Literal["fixed", "near", "uniform"] = "fixed"
-    """Goal of ant_maze: behind the walls, at the end of the first corridor, or random in each episode of training and
-    behind the walls in evaluation."""
+    """Goal of an arena: behind its obstacles; in ant_maze at the end of the first corridor; or drawn in each episode of
+    training, and behind the obstacles in evaluation."""
     change_after: Natural = 0
     """Episodes of each environment after which the room of nav2d changes; 0 for never."""
 
@@ -138,9 +138,9 @@ class OptionsConfig:
     frame: Literal["world", "heading"] = "world"
     """Axes in which E, D, P and F see a body that can face anywhere: the world's, or those of its heading, D at each
     tick, the others at the option's first."""
-    choose_view: bool = False
-    """Let two more entries of an option choose the view in which it is executed: by their direction one of the body's
-    equal sides is the front."""
+    choose: Literal["code", "way"] = "code"
+    """Entries by which a policy chooses an option: its code, or the way that it shall lead in the world's axes; then
+    the code and the side of the body as front are those of which P predicts that they lead farthest along it."""
     way_weight: Natural = 0
     """Entries of the state for which each of the two of the way counts in L_pred: where the body went, as a part of
     the state change; 0 leaves the way out."""
@@ -168,6 +168,8 @@ class PractiseConfig:
     """Budget of interactions per seed; 0 leaves D as learnt."""
     hold: int = 3
     """Most options for which a code from the prior is held."""
+    episode: int = 200
+    """Most ticks from a start to the next: short, as starts are where the body falls most."""
     speed: Positive = 1.5
     """Speed in m/s in a code's direction beyond which more earns nothing: fast ants fall."""
     control_cost: float = 0.1

@@ -40,26 +40,27 @@ def validate(config: Config) -> None:
 
 
 def _check_steering(config: Config) -> None:
-    """Check that D stays as it is if options choose their view; and that codes can be practised: D has to see the
-    state, and codes have to say where they go."""
+    """Check that D stays as it is if options are chosen by their way; and that a choice by the way, or practice, has
+    what it needs: codes that say where they lead from any heading, and for practice a D that sees the state."""
     options = config.options
-    if options.choose_view:
+    by_way = options.choose == "way"
+    if by_way:
         changes = {
             "train.fine_tune.epochs": config.train.fine_tune.epochs,
             "options.refresh_every": options.refresh_every,
         }
         for name, value in (changes | {"options.codes": options.codes}).items():
             if value:
-                raise impossible(name, value, "0 with options.choose_view", 0)
-    if not config.practise.ticks:
-        return
-    for name, value, needed, why in (
-        ("decoder", options.decoder, "closed", "since an open-loop D cannot react"),
-        ("frame", options.frame, "heading", "from which a code's direction is seen"),
-        ("way_weight", options.way_weight or None, options.way_weight or 16, "so that P tells where a code leads"),
+                raise impossible(name, value, "0 with options.choose way", 0)
+    practises = config.practise.ticks > 0
+    for applies, name, value, needed, why in (
+        (practises, "decoder", options.decoder, "closed", "since an open-loop D cannot react"),
+        (True, "frame", options.frame, "heading", "from which a code's direction is seen"),
+        (True, "way_weight", options.way_weight or None, options.way_weight or 16, "so that P tells the ways of codes"),
     ):
-        if value != needed:
-            raise impossible(f"options.{name}", value or 0, f"{needed} with practise.ticks, {why}", needed)
+        if applies and (practises or by_way) and value != needed:
+            reason = "practise.ticks" if practises else "options.choose way"
+            raise impossible(f"options.{name}", value or 0, f"{needed} with {reason}, {why}", needed)
 
 
 def _check_learners(config: Config) -> None:

@@ -42,7 +42,7 @@ def main(args: Sequence[str] | None = None) -> int:
 
 def _sees_heading(handle: "Handle") -> bool:
     options = handle.config.options
-    return options.frame == "heading" or options.way_weight > 0 or options.choose_view
+    return options.frame == "heading" or options.way_weight > 0
 
 
 def execute(command: Command, handle: "Handle") -> None:
@@ -54,7 +54,7 @@ def execute(command: Command, handle: "Handle") -> None:
     if not command.format:
         raise ConfigError(f"--format: expected some of {', '.join(FILES)}, got none")
     if "npz" in command.format and command.method == TAIC and _sees_heading(handle):
-        expected = "jax or onnx for options that see the heading or choose the view, which layers alone do not tell"
+        expected = "jax or onnx for options that see the heading, which layers alone do not tell"
         raise ConfigError(f"--format: expected {expected}; got npz")
     files, function = export(agent_of(handle, command.method, "--method", command.seed), command.format)
     options = handle.config.options if command.method == TAIC else None

@@ -8,6 +8,7 @@ from jaxtyping import Array, Bool, Float
 
 from taic_jax.config import OptionsConfig
 from taic_jax.networks import apply, gumbel, one_hot_of
+from taic_jax.options.choice import leading
 from taic_jax.options.model import OptionModel
 from taic_jax.options.termination import Termination, make_termination
 from taic_jax.types import Scalar
@@ -72,7 +73,7 @@ class IdentityExecutor(struct.PyTreeNode):
 
 
 class Decoding(struct.PyTreeNode):
-    """A running option: its code, D's carry, the termination rule's memory of it, and its view, None without choice."""
+    """A running option: its code, D's carry, the termination rule's memory of it, and its view if it has a way."""
 
     option: Array
     carry: Any
@@ -84,7 +85,7 @@ class OptionExecutor(struct.PyTreeNode):
     """D under a termination rule; with `std`, actions are drawn from a normal distribution around D's output.
 
     Discrete actions have D's greatest logit, after Gumbel noise times `std`: 1 draws them by their probabilities. With
-    `codes` an option is one-hot, one of the model's code book.
+    `codes` an option is one-hot, one of the model's code book; `by_way` it is the way that the option shall lead.
     """
 
     model: OptionModel
@@ -92,11 +93,12 @@ class OptionExecutor(struct.PyTreeNode):
     length: int = struct.field(pytree_node=False)
     std: Scalar = struct.field(default=None)
     codes: int = struct.field(pytree_node=False, default=0)
+    by_way: bool = struct.field(pytree_node=False, default=False)
 
     @property
     def option_size(self) -> int:
-        """D, two more if the option chooses its view; or the codes of the book."""
-        return self.codes or self.model.networks.encoder.option_size + (2 if self.model.views is not None else 0)
+        """D; the codes of the book; or 2 entries of the way."""
+        return 2 if self.by_way else self.codes or self.model.networks.encoder.option_size
 
     @property
     def discrete(self) -> bool:
@@ -109,18 +111,13 @@ class OptionExecutor(struct.PyTreeNode):
         return self.termination.noise_size + (0 if self.std is None else self.model.networks.decoder.action_size)
 
     def code(self, option: Float[Array, "*batch M"]) -> Float[Array, "*batch D"]:
-        """Return the codes of options."""
-        if self.codes:
-            return option @ self.model.book
-        return option if self.model.views is None else option[..., :-2]
-
-    def view(self, option: Float[Array, " M"]) -> Any:
-        """Return the view that an option chooses, or None."""
-        return None if self.model.views is None else self.model.views.nearest(option[-2:])
+        """Return the codes of options that are not chosen by their way."""
+        return option @ self.model.book if self.codes else option
 
     def start(self, option: Float[Array, " M"], obs: Float[Array, " S"]) -> Decoding:
         """Set D's carry from the code."""
-        code, view = self.code(option), self.view(option)
+        state = self._state(obs, None)
+        code, view = leading(self.model, option, state) if self.by_way else (self.code(option), None)
         carry = self._decoder(code, method="start")
         return Decoding(code, carry, self.termination.start(self.model, self._state(obs, view)), view)
 
@@ -163,5 +160,6 @@ def make_executor(config: OptionsConfig, model: OptionModel) -> OptionExecutor:
     """
     if config.delta_unit == "error":
         model = model.replace(delta=jnp.asarray(config.delta, jnp.float32))
-    executor = OptionExecutor(model, make_termination(config), config.length, codes=config.codes)
-    return executor.replace(std=jnp.ones(())) if config.sample_actions and model.networks.discrete else executor
+    std = jnp.ones(()) if config.sample_actions and model.networks.discrete else None
+    rule, by_way = make_termination(config), config.choose == "way"
+    return OptionExecutor(model, rule, config.length, std, config.codes, by_way)

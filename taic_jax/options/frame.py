@@ -38,15 +38,14 @@ class Frame(NamedTuple):
         w, x, y, z = (states[..., at + i] for i in range(4))
         turned = c * w + s * z, c * x + s * y, c * y - s * x, c * z - s * w
         sign = jnp.where(turned[0] < 0.0, -1.0, 1.0)  # a quaternion and its negative are the same rotation
-        forward, left = self._horizontal(states[..., v], states[..., v + 1], first)
-        entries = {at + i: sign * q for i, q in enumerate(turned)} | {v: forward, v + 1: left}
+        velocity = self.turned(states[..., v : v + 2], first)
+        entries = {at + i: sign * q for i, q in enumerate(turned)} | {v: velocity[..., 0], v + 1: velocity[..., 1]}
         return jnp.stack([entries.get(i, states[..., i]) for i in range(states.shape[-1])], axis=-1)
 
     def way(self, states: Float[Array, "*batch P"], first: Float[Array, "*#batch P"]) -> Float[Array, "*batch 2"]:
         """Return the way in m that the body goes in the tick after each state, seen from the first."""
         v = self.heading.velocity
-        steps = self._horizontal(states[..., v], states[..., v + 1], first)
-        return self.heading.dt * jnp.stack(steps, axis=-1)
+        return self.heading.dt * self.turned(states[..., v : v + 2], first)
 
     def change(
         self, states: Float[Array, "*batch P"], first: Float[Array, "*#batch P"], way: Float[Array, "*batch 2"]
@@ -60,14 +59,15 @@ class Frame(NamedTuple):
         first = states[:1]
         return self.change(states[1:], first, jnp.cumsum(self.way(states[:-1], first), axis=0))
 
-    def _horizontal(self, x: Array, y: Array, first: Float[Array, "*#batch P"]) -> tuple[Array, Array]:
-        """Return world components as seen from the heading of `first`."""
+    def turned(self, vector: Float[Array, "*batch 2"], first: Float[Array, "*#batch P"]) -> Float[Array, "*batch 2"]:
+        """Return horizontal vectors of the world as seen from the heading of `first`."""
         if not self.turns:
-            return x, y
+            return vector
         at = self.heading.quaternion
         half_c, half_s = _half_yaw(first[..., at], first[..., at + 3])
         c, s = jnp.square(half_c) - jnp.square(half_s), 2 * half_c * half_s
-        return c * x + s * y, c * y - s * x
+        x, y = vector[..., 0], vector[..., 1]
+        return jnp.stack([c * x + s * y, c * y - s * x], axis=-1)
 
 
 def _half_yaw(w: Array, z: Array) -> tuple[Array, Array]:

@@ -230,9 +230,9 @@ def learn(
       ShortExperienceError: delta is a quantile, and no experience is long enough to hold a part out.
       ValueError: `config.views` is all, and `views` is missing; or the frame needs a heading.
     """
-    if (config.views == "all" or config.choose_view) and views is None:
+    if (config.views == "all" or config.choose == "way") and views is None:
         raise ValueError(
-            "options.views: all and options.choose_view need the views of the body, as in learn(..., views=env.views); "
+            "options.views: all and options.choose: way need the views of the body, as in learn(..., views=env.views); "
             "got none"
         )
     config = as_arrays(config)
@@ -240,5 +240,5 @@ def learn(
     rows = dataset.experience
     networks = make_networks(config, rows.obs.shape[-1], rows.action.shape[-1], discrete, heading)
     state, losses = jax.lax.scan(lambda s, _: step(config, dataset, s), init(config, networks, key), None, config.steps)
-    model = as_model(state, dataset).replace(views=views if config.choose_view else None)
+    model = as_model(state, dataset).replace(views=views if config.choose == "way" else None)
     return model.replace(book=code_book(config, state, dataset)) if config.codes else model, losses

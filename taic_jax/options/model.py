@@ -184,7 +184,7 @@ class OptionModel(struct.PyTreeNode):
     """E, D, P and F with their parameters, and the scales of states and state changes.
 
     `delta` [] is the error of P at which termination predict ends an option. `book` [M, D] are the codes of discrete
-    options, None without `options.codes`. `views` are those of the body if an option chooses its own, else None.
+    options, None without `options.codes`. `views` are those of the body if options are chosen by their way.
     """
 
     params: dict
@@ -230,6 +230,11 @@ class OptionModel(struct.PyTreeNode):
     def predict(self, state: Float[Array, " P"], option: Float[Array, " D"]) -> Float[Array, " C"]:
         """Return the normalised change of a normalised state under an option."""
         return apply(self.networks.predictor, self.params["predictor"], state, option)
+
+    def way(self, option: Float[Array, " D"]) -> Float[Array, " 2"]:
+        """Return the way in m that P predicts of an option from the mean state, with a frame that has the way."""
+        predicted = self.predict(jnp.zeros(self.state_size), option)
+        return (predicted * self.change_scale.std + self.change_scale.mean)[-2:]
 
     def estimate(self, option: Float[Array, " D"]) -> Float[Array, "2 P"]:
         """Return F's estimate of the normalised start and end state."""

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Key
 
 from taic_jax.config import OptionsConfig, PPOConfig, PractiseConfig
 from taic_jax.envs.base import Env, State
-from taic_jax.envs.wrappers import AutoReset, Wrapper
+from taic_jax.envs.wrappers import AutoReset, TimeLimit, Wrapper
 from taic_jax.networks import PolicyParams
 from taic_jax.options.dataset import Window, gather
 from taic_jax.options.execution import make_executor
@@ -40,7 +40,7 @@ class PracticeState(struct.PyTreeNode):
     code: Array  # [D]
     direction: Array  # [2] seen from the heading, of length 1
     sector: Any  # of all codes
-    view: Array  # [] int32, in which D sees the state and acts; 0 if options do not choose it
+    view: Array  # [] int32, in which D sees the state and acts; 0 without options by their way
     left: Array  # [] int32, options for which the code is still held
     tick: Array  # [] int32, within the option
     key: Array
@@ -55,7 +55,7 @@ class Practising(Wrapper):
     """
 
     def __init__(self, env: Env, options: OptionsConfig, config: PractiseConfig, model: OptionModel):
-        super().__init__(AutoReset(env))
+        super().__init__(AutoReset(TimeLimit(env, config.episode)))
         self.model, self.options, self.config = model, options, config
         self.name = f"practice of {env.name}"
         self.observation_size = self.proprioceptive_size = model.state_size + options.size + 1
@@ -136,15 +136,9 @@ class Sector(NamedTuple):
 def sector_of(model: OptionModel) -> Sector:
     """Measure the sector over codes of the prior."""
     codes = jax.random.normal(jax.random.key(0), (SECTOR_CODES, model.networks.encoder.option_size))
-    ways = jax.vmap(partial(predicted_way, model))(codes)
+    ways = jax.vmap(model.way)(codes)
     middle = jnp.arctan2(*jnp.mean(ways, axis=0)[::-1])
     return Sector(middle, jnp.std(jax.vmap(partial(angle_from, middle))(ways)))
-
-
-def predicted_way(model: OptionModel, code: Float[Array, " D"]) -> Float[Array, " 2"]:
-    """Return the way in m of a code by P from the mean state, seen from the heading."""
-    predicted = model.predict(jnp.zeros(model.state_size), code)
-    return (predicted * model.change_scale.std + model.change_scale.mean)[-2:]
 
 
 def angle_from(middle: Float[Array, ""], way: Float[Array, " 2"]) -> Float[Array, ""]:
@@ -159,7 +153,7 @@ def direction(model: OptionModel, sector: Sector, code: Float[Array, " D"]) -> F
     Codes keep their order by P, and spread evenly over the part of the circle that one view has to cover: P, a mean,
     predicts ways that differ less than they do, and an ant that turns to where it goes sees them all ahead.
     """
-    share = jax.scipy.stats.norm.cdf(angle_from(sector.middle, predicted_way(model, code)) / sector.spread)
+    share = jax.scipy.stats.norm.cdf(angle_from(sector.middle, model.way(code)) / sector.spread)
     angle = sector.middle + jnp.pi / _sides(model) * (2.0 * share - 1.0)
     return jnp.stack([jnp.cos(angle), jnp.sin(angle)])
 
@@ -200,7 +194,7 @@ def refit(
     key_start, key_run, key_steps = jax.random.split(key, 3)
     env, executor = (
         AutoReset(env),
-        make_executor(dataclasses.replace(options, termination="fixed"), model.replace(views=None)),
+        make_executor(dataclasses.replace(options, termination="fixed", choose="code"), model),
     )
     begin = start(env, executor, REFIT_ENVS, key_start)
     ticks = REFIT_OPTIONS * options.length

@@ -164,8 +164,11 @@ def test_uniform_goals_fill_the_maze_and_are_observed():
     state = start("ant_maze", 2000, goal="uniform")
     goal = np.asarray(state.physics.goal)
     assert goal.min() >= -4 and goal.max() <= 20
-    np.testing.assert_allclose(goal.mean(0), 8, atol=0.5)
-    np.testing.assert_allclose(goal.std(0), 24 / np.sqrt(12), rtol=0.05)
+    in_the_bar = (goal[:, 0] < 12) & (goal[:, 1] > 4) & (goal[:, 1] < 12)
+    assert not in_the_bar.any()
+    # Two corridors of 24 x 8 m, and what joins them, 8 x 8 m.
+    np.testing.assert_allclose((goal[:, 0] > 12).mean(), 3 / 7, atol=0.04)
+    np.testing.assert_allclose((goal[:, 1] < 4).mean(), 3 / 7, atol=0.04)
     np.testing.assert_allclose(state.obs[:, 29:31], goal - state.physics.qpos[:, :2], atol=1e-5)
     np.testing.assert_allclose(
         state.physics.closest, np.linalg.norm(goal - state.physics.qpos[:, :2], axis=1), rtol=1e-5
@@ -294,3 +297,33 @@ def test_random_ants_stay_inside_and_blocks_within_their_limits(name):
     keys = jax.random.split(jax.random.key(1), 300)
     qpos = np.asarray(jax.jit(lambda s: jax.lax.scan(tick, s, keys)[1])(state))
     assert outside(env.arena, qpos) == 0 and np.isfinite(qpos).all()
+
+
+@pytest.mark.parametrize(("name", "height"), [("ant_push", None), ("ant_fall", 4.5)])
+def test_drawn_goals_are_where_an_ant_can_be(name, height):
+    """Of the push: not in its three solids. Of the fall: on the two platforms, at their height."""
+    goal = np.asarray(start(name, 500, goal="uniform").physics.goal)
+    arena = task(name)[0].arena
+    x, y = goal[:, 0], goal[:, 1]
+    within = [(x > a) & (x < c) & (y > b) & (y < d) for a, b, c, d in arena.solids]
+    if height is None:
+        assert goal.shape[1] == 2 and not np.any(within)
+        assert min(((x < -4) & (y < 12)).mean(), ((x > 4) & (y > 4)).mean(), (y > 12).mean()) > 0.05
+    else:
+        assert np.all(goal[:, 2] == height) and np.all(within[0] | within[1]) and min(w.mean() for w in within) > 0.2
+
+
+def test_an_ant_on_its_back_is_cut_after_40_ticks_in_training_alone():
+    for training in (True, False):
+        env = make_env("ant_maze", "mujoco")
+        env = env if training else env.evaluated
+        step = jax.jit(jax.vmap(env.step))
+        state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 2))
+        over = state.physics.qpos.at[0, 3:7].set(jnp.array([0.0, 1.0, 0.0, 0.0])).at[0, 2].set(0.6)
+        state = state.replace(physics=state.physics.replace(qpos=over))
+        cut = []
+        for _ in range(41):
+            state = step(state, jnp.zeros((2, 8)))
+            cut.append(np.asarray(state.truncated))
+        assert not np.any(cut[:39]) and not np.any(state.terminated)
+        assert np.asarray(cut)[39].tolist() == [training, False]

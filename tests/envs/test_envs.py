@@ -128,8 +128,8 @@ def test_a_wrong_name_gets_one_line_with_the_nearest(given, hint):
             "env.model: nav2d has no such option, got 'gym'; its options: change_after",
         ),
         (
-            {"name": "ant_push", "goal": "uniform"},
-            "env.goal: ant_push has no such option, got 'uniform'; its options: body",
+            {"name": "ant_headings", "goal": "uniform"},
+            "env.goal: ant_headings has no such option, got 'uniform'; its options: body",
         ),
         ({"name": "ant_turn", "body": "hiro"}, "env.body: ant_turn has no such option, got 'hiro'; its options: none"),
     ],

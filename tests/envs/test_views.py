@@ -126,7 +126,7 @@ def test_noise_on_the_state_makes_a_closed_loop_decoder_heed_the_code():
 
 def test_all_views_are_not_learnt_from_where_none_are_given():
     config = OptionsConfig(length=2, select="random", views="all")
-    with pytest.raises(ValueError, match=r"options.views: all and options.choose_view need the views of the body"):
+    with pytest.raises(ValueError, match=r"options.views: all and options.choose: way need the views of the body"):
         learn(config, experience(), jax.random.key(0))
 
 

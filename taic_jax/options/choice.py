@@ -1,0 +1,27 @@
+"""The choice of an option by its consequence: the way that it shall lead (eq. 8)."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from taic_jax.options.model import OptionModel
+
+MENU = 64  # codes of the prior among which the choice is
+
+
+def leading(
+    model: OptionModel, way: Float[Array, " 2"], state: Float[Array, " P"]
+) -> tuple[Float[Array, " D"], Int[Array, ""]]:
+    """Return the code and the view of the body that lead farthest along a way in the world's axes.
+
+    P predicts the ways of codes from the mean state, seen from the heading; the length of `way` does not matter.
+    """
+    frame: Any = model.networks.frame
+    size = model.networks.encoder.option_size
+    codes = jnp.asarray(np.random.default_rng(0).standard_normal((MENU, size)), jnp.float32)
+    gain = model.views.directions(frame.turned(way, state)) @ jax.vmap(model.way)(codes).T
+    best = jnp.argmax(gain).astype(jnp.int32)
+    return codes[best % MENU], best // MENU
