@@ -28,6 +28,7 @@ GYM: dict[str, Any] = {"env.model": "gym"}  # so that the agents act in Gymnasiu
 AS_LEARNT: dict[str, Any] = {"train.fine_tune.epochs": 0}  # options to carry to other tasks
 CHANGES = {
     "nav2d": {}, "half_cheetah": GYM, "hopper": GYM, "walker2d": GYM, "ant": AS_LEARNT, "ant_steering": AS_LEARNT,
+    "steering": {},
 }  # fmt: skip
 """The presets, and the fields of each that differ here."""
 
@@ -73,7 +74,7 @@ def card(name: str, config: Config, summary: Summary) -> dict[str, Any]:
         "preset": name,
         "changes": CHANGES[name],
         "task": config.env.name,
-        "data": f"the last {experience_ticks(collect):,} of {collect.ticks:,} ticks of flat PPO's training on "
+        "data": f"the last {experience_ticks(collect):,} of {collect.ticks:,} ticks of flat {collect.learner.upper()}'s training on "
         f"{collect.env or config.env.name}",
         "interactions": summary["ticks"],
         "episodes": config.evaluate.episodes,

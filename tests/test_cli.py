@@ -115,7 +115,7 @@ def test_options_of_a_run_are_short_for_their_source():
 
 BAD_ARGUMENTS = {
     "transfer from nowhere": (
-        "transfer_ant_maze",
+        "ant --train.baselines transfer",
         "train.baselines: expected with transfer a run",
         "add --options RUN",
     ),

@@ -45,16 +45,25 @@ STEERING = {"options.length": 20, "options.views": "all", "options.state_noise":
 MANY = {"num_envs": 64, "rollout_length": 250}
 CARRIED = STEERING | {"train.ppo.learning_rate": 6e-4, "train.ppo.minibatch_size": 64}
 CARRIED |= {f"train.ppo.{field}": value for field, value in MANY.items()}
-ARENA = {"collect.ppo.gamma": 0.999, "train.ppo.gamma": 0.999}
-DRAWN = {"env.goal": "uniform"} | {f"collect.ppo.{field}": value for field, value in MANY.items()}
-TRANSFERS = {"turn": {"train.fine_tune.std": 0.2}, "maze": ARENA | DRAWN, "push": ARENA, "fall": ARENA}
+PPO_IN_ARENAS = {f"collect.ppo.{field}": value for field, value in MANY.items()} | {"collect.ppo.gamma": 0.999}
+ARENA = {"env.goal": "uniform", "collect.env": "", "collect.learner": "ppo", "practise.ticks": 0} | PPO_IN_ARENAS
+ARENA |= {"options.source": "pretrained:steering"}
+TICKS = {"collect.ticks": 1_000_000, "train.ticks": 1_000_000, "train.baselines": ("flat",), "train.learner": "sac"}
 
 
-@pytest.mark.parametrize("task", TRANSFERS)
-def test_presets_of_transfer_differ_from_ant_in_what_the_task_asks_for(task):
-    every = {"env.name": f"ant_{task}", "train.ticks": 3_000_000, "train.baselines": ("flat", "transfer")}
-    expected = dict(walk(load_config("ant"))) | CARRIED | every | TRANSFERS[task]
-    assert dict(walk(load_config(f"transfer_ant_{task}"))) == expected
+def test_the_preset_of_turning_differs_from_ant_in_what_the_task_asks_for():
+    own = {"env.name": "ant_turn", "train.ticks": 3_000_000, "train.baselines": ("flat", "transfer")}
+    own |= {"options.source": "pretrained:ant_steering", "train.fine_tune.std": 0.2}
+    expected = dict(walk(load_config("ant"))) | CARRIED | own
+    assert dict(walk(load_config("transfer_ant_turn"))) == expected
+
+
+@pytest.mark.parametrize("task", ["ant_maze", "ant_push", "ant_fall"])
+def test_presets_of_the_arenas_differ_from_steering_in_task_and_learner(task):
+    preset = dict(walk(load_config(f"transfer_{task}")))
+    expected = dict(walk(load_config("steering"))) | ARENA | TICKS | {"env.name": task}
+    differing = {name for name in expected if preset[name] != expected[name]}
+    assert all(name.startswith("train.sac.") for name in differing) and preset["train.sac.relabel"] == 4
 
 
 def test_options_that_steer_differ_from_those_of_ant_in_how_they_are_learnt():

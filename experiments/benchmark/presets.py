@@ -6,7 +6,6 @@ python -m taic_jax.experiments.benchmark.presets > experiments/results/presets.c
 import tempfile
 from pathlib import Path
 
-from taic_jax.config import replace
 from taic_jax.config.files import load_config, preset_names
 from taic_jax.handles.calibration import calibrate
 from taic_jax.runtime.program_cache import keep_programs
@@ -17,10 +16,8 @@ def main() -> None:
     keep_programs()
     print("preset,minutes")
     for name in preset_names():
-        source = "pretrained:ant_steering" if name.startswith("transfer") else ""
-        config = replace(load_config(name), "options.source", source)
         with tempfile.TemporaryDirectory() as folder:
-            print(f"{name},{calibrate(config, Path(folder) / name).seconds / 60:.2g}", flush=True)
+            print(f"{name},{calibrate(load_config(name), Path(folder) / name).seconds / 60:.2g}", flush=True)
 
 
 if __name__ == "__main__":

@@ -146,12 +146,18 @@ def robots(task: str, run_dir: Path, chunk: int = 10) -> list[Cell]:
     return cells
 
 
+# As the rows of the arenas were made, by PPO over the options of `ant_steering`; the presets have changed since.
+ARENA = {"collect.ppo.gamma": 0.999, "train.ppo.gamma": 0.999, "train.fine_tune.std": 0.1}
+MAZE = {"ant_maze": {"env.goal": "uniform", "collect.ppo.num_envs": 64, "collect.ppo.rollout_length": 250}}
+
+
 def transfers(task: str, run_dir: Path, seeds: int = 10) -> list[Cell]:
     """Return the runs of figure 8 on one task; policy and experience are of the ant's run `ant/source`.
 
     That is as long as the ant's own runs: after half the ticks the ant is too slow to cross an arena in an episode.
     """
-    ant, preset = load_config("ant"), load_config(f"transfer_{task}")
+    ant, turn = load_config("ant"), load_config("transfer_ant_turn")
+    preset = turn if task == "ant_turn" else replace_all(turn, ARENA | {"env.name": task} | MAZE.get(task, {}))
     runs = {name: str(run_dir / name) for name in ("ant/source", "ant/source-open", "ant/source-steering")}
     source = one_iteration(replace(ant, "collect.ticks", TICKS["ant"]), seeds)
     from_source = {"options.experience": (runs["ant/source"],)}

@@ -176,6 +176,8 @@ class PractiseConfig:
     """Weight of |action|^2 in the reward."""
     upright: float = 1.0
     """Weight of the upward part of the torso's own axis in the reward."""
+    fall: float = 500.0
+    """Cost of an end of the task, which is an overturned body, besides all reward that it forgoes."""
     refit_steps: int = 1000
     """Gradient steps at the end that refit E, P and F to D."""
     ppo: PPOConfig = PPOConfig(

@@ -7,7 +7,7 @@ import jax
 import psutil
 
 from taic_jax.artifacts.experience import experience_bytes
-from taic_jax.config import Config, ConfigError, Shard, experience_ticks, needs_collect, replace, settings_of
+from taic_jax.config import PRACTISE, Config, ConfigError, Shard, experience_ticks, needs_collect, replace, settings_of
 from taic_jax.options.dataset import HELD_OUT_EVERY, STRETCH
 from taic_jax.pipeline import run_pipeline
 from taic_jax.runtime.logging import count_of
@@ -44,6 +44,7 @@ def calibrate(config: Config, folder: Path, shard: Shard = "none") -> Cost:
         raise ConfigError(str(error)) from None
     collect, train, seconds = config.collect.ticks, config.train.ticks, 0.0
     sizes = {"collect": collect, "learn": config.options.steps, "total": collect + train}
+    sizes[PRACTISE] = config.practise.ticks
     metrics = RunFolder(folder).metrics
     for stage in {row["stage"] for row in metrics()} - {"evaluate"}:
         rows = metrics(stage)

@@ -81,7 +81,10 @@ def film(handle: "Handle", method: str, command: Command) -> np.ndarray:
     marks = ticks.decision if agent.executor.length > 1 else np.zeros(end, bool)  # flat PPO decides at every tick
     shown = np.arange(0, end, ticks_per_frame(env.dt))
     frames = env.render(jax.tree.map(lambda x: x[shown], ticks.extras))
-    return with_label(with_options(frames, ticks.option[latest[shown]], np.logical_or.reduceat(marks, shown)), label)
+    options = ticks.option[latest[shown]]
+    if handle.config.options.choose == "way" and method == TAIC:
+        frames = with_compass(frames, options)
+    return with_label(with_options(frames, options, np.logical_or.reduceat(marks, shown)), label)
 
 
 def with_label(frames: np.ndarray, text: str) -> np.ndarray:
@@ -92,6 +95,23 @@ def with_label(frames: np.ndarray, text: str) -> np.ndarray:
     corner = frames[:, :16, : int(draw.textlength(text)) + 12]
     corner[:] = np.maximum(corner // 4, np.asarray(image)[:, : corner.shape[2], None])
     return frames
+
+
+def with_compass(frames: np.ndarray, ways: np.ndarray) -> np.ndarray:
+    """Draw in the upper right corner of each frame an arrow along the way [F, 2] of its option: x right, y up."""
+    radius = max(frames.shape[1] // 10, 12)
+    centre, shape = np.array([frames.shape[2] - radius - 4, radius + 4]), np.array([[1.0, 0], [-0.2, 0.5], [-0.2, -0.5]])
+    drawn = []
+    for frame, way in zip(frames, ways, strict=True):
+        x, y = way / max(np.linalg.norm(way), 1e-6) * (1, -1)  # pixels count downwards
+        image = Image.fromarray(frame)
+        draw = ImageDraw.Draw(image)
+        draw.circle(tuple(centre), radius, outline=MARK, width=2)
+        tips = centre + 0.8 * radius * shape @ np.array([[x, y], [-y, x]])
+        draw.line([tuple(centre - 0.7 * radius * np.array([x, y])), tuple(centre)], fill=MARK, width=2)
+        draw.polygon([tuple(tip) for tip in tips], fill=MARK)
+        drawn.append(np.asarray(image))
+    return np.stack(drawn)
 
 
 def with_options(frames: np.ndarray, options: np.ndarray, decision: np.ndarray) -> np.ndarray:

@@ -79,6 +79,7 @@ class Practising(Wrapper):
         views = self.model.views
         inner = self.env.step(before.inner, views.action(views.back(before.view), action) if views else action)
         reward, metrics = self._judge(before, self._state(before, inner.final_obs), action)
+        reward -= self.config.fall * inner.terminated.astype(jnp.float32)
         tick = before.tick + 1
         ended = tick >= self.options.length
         left = before.left - ended.astype(jnp.int32)

@@ -105,4 +105,4 @@ def test_the_table_of_presets_has_a_row_of_each(monkeypatch, capsys):
     presets.main()
     header, *rows = capsys.readouterr().out.splitlines()
     assert header == "preset,minutes" and set(rows) == {f"{name},12" for name in preset_names()}
-    assert sources["transfer_ant_maze"] == "pretrained:ant_steering" and sources["ant"] == ""
+    assert sources["transfer_ant_maze"] == "pretrained:steering" and sources["ant"] == ""

@@ -19,7 +19,7 @@ from taic_jax.command_line import COMMON_FIELDS
 from taic_jax.config.files import preset_names
 from taic_jax.envs.locomotion import Locomotion
 from taic_jax.handles import assess, play
-from taic_jax.handles.play import MARK, with_label, with_options
+from taic_jax.handles.play import MARK, with_compass, with_label, with_options
 from taic_jax.run import PROGRAM
 from taic_jax.runtime.files import save_json
 from taic_jax.runtime.run_folder import RunFolder
@@ -118,6 +118,18 @@ def test_the_strip_shows_the_options_of_past_ticks_and_marks_decisions():
     assert tuple(frames[2, -1, 157]) == tuple(frames[2, -1, 156]) == first  # it was a tick of the option before
     assert tuple(frames[2, -1, 155]) == first and tuple(frames[2, -1, 154]) == MARK
     assert not frames[2, -1, :154].any() and not frames[:, :40].any()
+
+
+def test_a_ways_arrow_points_where_it_leads():
+    """White pixels of the corner lie towards the arrow's tip: right, up, left and down."""
+    ways = np.array([[3.0, 0.0], [0.0, 0.1], [-1.0, 0.0], [0.0, -2.0]])
+    plain, frames = np.zeros((4, 240, 320, 3), np.uint8), np.zeros((4, 240, 320, 3), np.uint8)
+    frames = with_compass(frames, ways)
+    assert not frames[:, 60:].any() and not frames[:, :, :260].any() and frames.shape == plain.shape
+    for frame, (x, y) in zip(frames, ways, strict=True):
+        rows, columns = np.nonzero(frame[8:48, 272:312].any(axis=-1))  # within the circle
+        lean = np.array([columns.mean() - 19.5, 19.5 - rows.mean()])
+        assert lean @ [x, y] / np.linalg.norm([x, y]) > 1.0
 
 
 MISTAKES = {

@@ -12,7 +12,7 @@ LINES = {
     "": " ".join(COMMANDS),
     "ru": "run",
     "run nav": "nav2d nav2d_change nav2d_dqn",
-    "sweep transfer_ant_m": "transfer_ant_maze transfer_ant_maze_sac",
+    "sweep transfer_ant_m": "transfer_ant_maze",
     "run nav2d --train.ppo.learning": "--train.ppo.learning-rate --train.ppo.learning-rate-decay",
     "run nav2d --train.ppo.lam": "--train.ppo.lambda_",
     "play runs/a --ti": "--ticks",
