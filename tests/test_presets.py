@@ -47,7 +47,7 @@ CARRIED = STEERING | {"train.ppo.learning_rate": 6e-4, "train.ppo.minibatch_size
 CARRIED |= {f"train.ppo.{field}": value for field, value in MANY.items()}
 PPO_IN_ARENAS = {f"collect.ppo.{field}": value for field, value in MANY.items()} | {"collect.ppo.gamma": 0.999}
 ARENA = {"env.goal": "uniform", "collect.env": "", "collect.learner": "ppo", "practise.ticks": 0} | PPO_IN_ARENAS
-ARENA |= {"options.source": "pretrained:steering"}
+ARENA |= {"options.source": "pretrained:steering", "env.contacts": "feet"}
 TICKS = {"collect.ticks": 1_000_000, "train.ticks": 1_000_000, "train.baselines": ("flat",), "train.learner": "sac"}
 
 

@@ -100,14 +100,15 @@ def with_label(frames: np.ndarray, text: str) -> np.ndarray:
 def with_compass(frames: np.ndarray, ways: np.ndarray) -> np.ndarray:
     """Draw in the upper right corner of each frame an arrow along the way [F, 2] of its option: x right, y up."""
     radius = max(frames.shape[1] // 10, 12)
-    centre, shape = np.array([frames.shape[2] - radius - 4, radius + 4]), np.array([[1.0, 0], [-0.2, 0.5], [-0.2, -0.5]])
+    centre = np.array([frames.shape[2] - radius - 4, radius + 4])
+    head = np.array([[1.0, 0.0], [-0.2, 0.5], [-0.2, -0.5]])
     drawn = []
     for frame, way in zip(frames, ways, strict=True):
         x, y = way / max(np.linalg.norm(way), 1e-6) * (1, -1)  # pixels count downwards
         image = Image.fromarray(frame)
         draw = ImageDraw.Draw(image)
         draw.circle(tuple(centre), radius, outline=MARK, width=2)
-        tips = centre + 0.8 * radius * shape @ np.array([[x, y], [-y, x]])
+        tips = centre + 0.8 * radius * head @ np.array([[x, y], [-y, x]])
         draw.line([tuple(centre - 0.7 * radius * np.array([x, y])), tuple(centre)], fill=MARK, width=2)
         draw.polygon([tuple(tip) for tip in tips], fill=MARK)
         drawn.append(np.asarray(image))
