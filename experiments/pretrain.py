@@ -74,8 +74,8 @@ def card(name: str, config: Config, summary: Summary) -> dict[str, Any]:
         "preset": name,
         "changes": CHANGES[name],
         "task": config.env.name,
-        "data": f"the last {experience_ticks(collect):,} of {collect.ticks:,} ticks of flat {collect.learner.upper()}'s training "
-        f"on {collect.env or config.env.name}",
+        "data": f"the last {experience_ticks(collect):,} of {collect.ticks:,} ticks of flat "
+        f"{collect.learner.upper()}'s training on {collect.env or config.env.name}",
         "interactions": summary["ticks"],
         "episodes": config.evaluate.episodes,
         "return_mean_option": {method: x["return_mean_option"]["mean"] for method, x in methods.items()},

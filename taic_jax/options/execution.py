@@ -160,6 +160,6 @@ def make_executor(config: OptionsConfig, model: OptionModel) -> OptionExecutor:
     """
     if config.delta_unit == "error":
         model = model.replace(delta=jnp.asarray(config.delta, jnp.float32))
-    std = jnp.ones(()) if config.sample_actions and model.networks.discrete else None
+    std: Any = jnp.ones(()) if config.sample_actions and model.networks.discrete else None
     rule, by_way = make_termination(config), config.choose == "way"
     return OptionExecutor(model, rule, config.length, std, config.codes, by_way)
