@@ -168,16 +168,12 @@ class PractiseConfig:
     """Budget of interactions per seed; 0 leaves D as learnt."""
     hold: int = 3
     """Most options for which a code from the prior is held."""
-    episode: int = 200
-    """Most ticks from a start to the next: short, as starts are where the body falls most."""
     speed: Positive = 1.5
     """Speed in m/s in a code's direction beyond which more earns nothing: fast ants fall."""
     control_cost: float = 0.1
     """Weight of |action|^2 in the reward."""
     upright: float = 1.0
     """Weight of the upward part of the torso's own axis in the reward."""
-    fall: float = 500.0
-    """Cost of an end of the task, which is an overturned body, besides all reward that it forgoes."""
     refit_steps: int = 1000
     """Gradient steps at the end that refit E, P and F to D."""
     ppo: PPOConfig = PPOConfig(

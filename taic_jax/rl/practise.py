@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Key
 
 from taic_jax.config import OptionsConfig, PPOConfig, PractiseConfig
 from taic_jax.envs.base import Env, State
-from taic_jax.envs.wrappers import AutoReset, TimeLimit, Wrapper
+from taic_jax.envs.wrappers import AutoReset, Wrapper
 from taic_jax.networks import PolicyParams
 from taic_jax.options.dataset import Window, gather
 from taic_jax.options.execution import make_executor
@@ -55,7 +55,7 @@ class Practising(Wrapper):
     """
 
     def __init__(self, env: Env, options: OptionsConfig, config: PractiseConfig, model: OptionModel):
-        super().__init__(AutoReset(TimeLimit(env, config.episode)))
+        super().__init__(AutoReset(env))
         self.model, self.options, self.config = model, options, config
         self.name = f"practice of {env.name}"
         self.observation_size = self.proprioceptive_size = model.state_size + options.size + 1
@@ -79,7 +79,6 @@ class Practising(Wrapper):
         views = self.model.views
         inner = self.env.step(before.inner, views.action(views.back(before.view), action) if views else action)
         reward, metrics = self._judge(before, self._state(before, inner.final_obs), action)
-        reward -= self.config.fall * inner.terminated.astype(jnp.float32)
         tick = before.tick + 1
         ended = tick >= self.options.length
         left = before.left - ended.astype(jnp.int32)
