@@ -168,10 +168,15 @@ class PractiseConfig:
     """Budget of interactions per seed; 0 leaves D as learnt."""
     hold: int = 3
     """Most options for which a code from the prior is held."""
+    reward: Literal["direction", "information"] = "direction"
+    """Reward besides being upright: the speed in a code's direction; or, at an option's end, how much better its code
+    than others predicts its way (eq. 8): the mutual information of code and way."""
     speed: Positive = 1.5
     """Speed in m/s in a code's direction beyond which more earns nothing: fast ants fall."""
     control_cost: float = 0.1
     """Weight of |action|^2 in the reward."""
+    kl_weight: float = 0.0
+    """Weight of half the squared change of D's actions since it was learnt: a KL divergence under noise of 1."""
     upright: float = 1.0
     """Weight of the upward part of the torso's own axis in the reward."""
     refit_steps: int = 1000

@@ -82,6 +82,8 @@ class ReplayConfig:
     """Step size of Adam."""
     gamma: Share = 0.99
     """Discount per tick."""
+    reward_scale: Positive = 1.0
+    """Factor of rewards in targets: the critics' step size limits how fast values of thousands are learnt."""
     tau: Share = 0.005
     """Share of the critics that their targets take over at each gradient step."""
 

@@ -179,7 +179,8 @@ def improve(
             chosen = jax.random.bernoulli(key_goal, share, (config.batch_size,))
             batch = select(chosen, relabelled(batch, later, config.gamma, goals), batch)
         obs, next_obs = (normalize.normalize(state.obs_statistics, x) for x in (batch.obs, batch.next_obs))
-        learnt, terms = rule.update(config, executor, carry[0], batch.replace(obs=obs, next_obs=next_obs), key_update)
+        batch = batch.replace(obs=obs, next_obs=next_obs, reward=config.reward_scale * batch.reward)
+        learnt, terms = rule.update(config, executor, carry[0], batch, key_update)
         return learnt, carry[1] + terms
 
     steps = count.astype(jnp.int32)

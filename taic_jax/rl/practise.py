@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Key
 from taic_jax.config import OptionsConfig, PPOConfig, PractiseConfig
 from taic_jax.envs.base import Env, State
 from taic_jax.envs.wrappers import AutoReset, Wrapper
-from taic_jax.networks import PolicyParams
+from taic_jax.networks import PolicyParams, apply
 from taic_jax.options.dataset import Window, gather
 from taic_jax.options.execution import make_executor
 from taic_jax.options.learning import descend
@@ -29,7 +29,7 @@ from taic_jax.rl.rollout import rollout, start
 METRICS = ("speed_along", "speed_across", "upright")
 REFIT_ENVS, REFIT_OPTIONS = 64, 40
 """Environments, and options in each, from which E and P are refitted."""
-SECTOR_CODES = 256
+SECTOR_CODES, OTHERS = 256, 32  # codes that measure the sector, and that one code is compared with
 
 
 class PracticeState(struct.PyTreeNode):
@@ -39,6 +39,8 @@ class PracticeState(struct.PyTreeNode):
     obs: Array
     code: Array  # [D]
     direction: Array  # [2] seen from the heading, of length 1
+    first: Array  # [P] state in which the option began, in its view
+    way: Array  # [2] m since then, seen from it
     sector: Any  # of all codes
     view: Array  # [] int32, in which D sees the state and acts; 0 without options by their way
     left: Array  # [] int32, options for which the code is still held
@@ -49,14 +51,16 @@ class PracticeState(struct.PyTreeNode):
 class Practising(Wrapper):
     """A task whose observation is D's input: the state that D sees, a code from the prior, and the share of its ticks.
 
-    The reward of a tick is the speed in m/s in the code's direction, seen from the heading and up to `speed`, less half
-    the speed across it and the control cost, plus the upward part of the body's own axis. Episodes end as those of the
-    inner task, which resets itself: what resets a batch under `vmap` may not read a model of its own in each row.
+    The reward of a tick is the upward part of the body's own axis, less the costs of control and of change; and the
+    speed in m/s in the code's direction, seen from the heading and up to `speed`, less half the speed across it, or at
+    an option's end the information. Episodes end as those of the inner task, which resets itself: what resets a batch
+    under `vmap` may not read a model of its own in each row.
     """
 
     def __init__(self, env: Env, options: OptionsConfig, config: PractiseConfig, model: OptionModel):
         super().__init__(AutoReset(env))
         self.model, self.options, self.config = model, options, config
+        self.frame: Any = model.networks.frame
         self.name = f"practice of {env.name}"
         self.observation_size = self.proprioceptive_size = model.state_size + options.size + 1
 
@@ -66,7 +70,9 @@ class Practising(Wrapper):
         zero, nothing = jnp.zeros((), jnp.int32), jnp.zeros(self.options.size)
         inner = self.env.reset(key_inner)
         obs, sector = jnp.zeros(self.observation_size), sector_of(self.model)
-        practice = self._draw(PracticeState(inner, obs, nothing, jnp.zeros(2), sector, zero, zero, zero, key))
+        first = inner.obs[: self.model.state_size]
+        start = PracticeState(inner, obs, nothing, jnp.zeros(2), first, jnp.zeros(2), sector, zero, zero, zero, key)
+        practice = self._draw(start)
         return State.first(practice, practice.obs, dict.fromkeys(METRICS, jnp.zeros(())))
 
     def restart(self, key: Key[Array, ""], ended: PracticeState) -> State:
@@ -78,12 +84,18 @@ class Practising(Wrapper):
         before: PracticeState = state.physics
         views = self.model.views
         inner = self.env.step(before.inner, views.action(views.back(before.view), action) if views else action)
-        reward, metrics = self._judge(before, self._state(before, inner.final_obs), action)
-        tick = before.tick + 1
+        after, tick = self._state(before, inner.final_obs), before.tick + 1
         ended = tick >= self.options.length
-        left = before.left - ended.astype(jnp.int32)
-        practice = before.replace(inner=inner, tick=jnp.where(ended, 0, tick), left=left)
-        practice = practice.replace(obs=self._observe(practice, inner.obs))
+        way = before.way + self.frame.way(after, before.first)
+        reward, metrics = self._judge(before.replace(way=way), after, action)
+        practice = before.replace(
+            inner=inner,
+            tick=jnp.where(ended, 0, tick),
+            left=before.left - ended.astype(jnp.int32),
+            first=jnp.where(ended, after, before.first),
+            way=jnp.where(ended, 0.0, way),
+        )
+        left, practice = practice.left, practice.replace(obs=self._observe(practice, inner.obs))
         new = (left <= 0) | inner.terminated | inner.truncated
         practice = jax.tree.map(lambda x, y: jnp.where(new, x, y), self._draw(practice), practice)
         final = self._observe(before.replace(tick=tick), inner.final_obs)
@@ -98,9 +110,10 @@ class Practising(Wrapper):
         left, tick = jax.random.randint(key_left, (), 1, self.config.hold + 1), jnp.zeros((), jnp.int32)
         practice = practice.replace(
             code=code, direction=direction(self.model, practice.sector, code), left=left, tick=tick, key=key,
-            view=jax.random.randint(key_view, (), 0, _sides(self.model)),
+            view=jax.random.randint(key_view, (), 0, _sides(self.model)), way=jnp.zeros(2),
         )  # fmt: skip
-        return practice.replace(obs=self._observe(practice, practice.inner.obs))
+        first = self._state(practice, practice.inner.obs)
+        return practice.replace(first=first, obs=self._observe(practice, practice.inner.obs))
 
     def _observe(self, practice: PracticeState, obs: Float[Array, " I"]) -> Float[Array, " S"]:
         state = self._state(practice, obs)
@@ -114,16 +127,39 @@ class Practising(Wrapper):
     def _judge(
         self, before: PracticeState, state: Float[Array, " P"], action: Float[Array, " A"]
     ) -> tuple[Array, dict[str, Array]]:
-        frame: Any = self.model.networks.frame
-        first = self._state(before, before.inner.obs)
-        velocity = frame.way(state, first) / self.dt
+        """Return reward and metrics of the tick; `before` has the way up to its end."""
+        config, first = self.config, self._state(before, before.inner.obs)
+        velocity = self.frame.way(state, first) / self.dt
         along = velocity @ before.direction
         across = jnp.abs(velocity[0] * before.direction[1] - velocity[1] * before.direction[0])
-        at = frame.heading.quaternion
+        at = self.frame.heading.quaternion
         upright = 1 - 2 * (state[at + 1] ** 2 + state[at + 2] ** 2)
-        reward = jnp.minimum(along, self.config.speed) - 0.5 * across + self.config.upright * upright
-        reward -= self.config.control_cost * jnp.sum(action**2)
+        model, length = self.model, self.options.length
+        inputs = before.code, model.see(first, first), before.tick, length
+        as_learnt = apply(model.networks.decoder, model.params["decoder"], *inputs, method="at")
+        reward = config.upright * upright - config.control_cost * jnp.sum(action**2)
+        reward -= 0.5 * config.kl_weight * jnp.sum(jnp.square(action - as_learnt))
+        if config.reward == "direction":
+            reward += jnp.minimum(along, config.speed) - 0.5 * across
+        else:
+            reward += jnp.where(before.tick + 1 >= length, length * information(model, before), 0.0)
         return reward, dict(zip(METRICS, (along, across, upright), strict=True))
+
+
+def information(model: OptionModel, practice: PracticeState) -> Float[Array, ""]:
+    """Return how much likelier the way of an option is by its own code than by others of the prior, in nats.
+
+    The way is normal around P's prediction, with the standard deviation of all ways (eq. 8).
+    """
+    first, scale = model.see(practice.first, practice.first), model.change_scale
+    way = (practice.way - scale.mean[-2:]) / scale.std[-2:]
+
+    def log_likelihood(code: Float[Array, " D"]) -> Float[Array, ""]:
+        return -0.5 * jnp.sum(jnp.square(model.predict(first, code)[-2:] - way))
+
+    others = jax.random.normal(jax.random.key(1), (OTHERS, len(practice.code)))
+    among = jax.nn.logsumexp(jax.vmap(log_likelihood)(others)) - jnp.log(float(OTHERS))
+    return log_likelihood(practice.code) - among
 
 
 class Sector(NamedTuple):

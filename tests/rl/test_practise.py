@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from probes import assert_trees_equal, numbers, random_model
-from scipy import stats
+from scipy import special, stats
 from sled import Sled
 from tiny_runs import (
     CONFIG,
@@ -71,7 +71,11 @@ def task(model):
 
 @pytest.fixture(scope="module")
 def walk(task):
-    """Ticks [T, B] of random actions: actions and states."""
+    return walked(task)
+
+
+def walked(task):
+    """Return random actions of ticks [T, B], the first state and all later ones."""
     actions = jax.random.uniform(jax.random.key(1), (120, 8, 2), minval=-1.0)
     env = AutoReset(task)
 
@@ -124,6 +128,40 @@ def test_the_reward_is_of_the_speed_in_the_codes_direction(model, walk):
     across = jnp.abs(actions[..., 0] * directions[..., 1] - actions[..., 1] * directions[..., 0])
     expected = jnp.minimum(along, 0.8) - 0.5 * across + 1.0 - 0.1 * jnp.sum(actions**2, axis=-1)
     np.testing.assert_allclose(states.reward, expected, atol=1e-4)
+
+
+def test_the_information_of_a_code_is_paid_at_an_options_end(model, walk):
+    """From the likelihoods of 32 other codes; the sled's way is half a second of each action, in its own frame."""
+    actions, _, states = walked(Practising(SLED, OPTIONS, dataclasses.replace(PRACTICE, reward="information"), model))
+    paid = states.reward - (1.0 - 0.1 * jnp.sum(actions**2, axis=-1))
+    others, scale = jax.random.normal(jax.random.key(1), (32, 2)), model.change_scale
+    practice, count = states.physics, 0
+    for b in range(8):
+        for t in range(1, 49):  # within the first episode
+            ended = int(practice.tick[t - 1, b]) + 1 == L
+            if not ended or t < L:
+                assert t < L or abs(float(paid[t, b])) < 1e-4
+                continue
+            first = practice.inner.obs[t - L, b]
+            way = (0.5 * actions[t - L + 1 : t + 1, b].sum(axis=0) - scale.mean[-2:]) / scale.std[-2:]
+            codes = jnp.vstack([practice.code[t - 1, b][None], others])
+            ways = jnp.stack([model.predict(model.see(first, first), code)[-2:] for code in codes])
+            nats = -0.5 * np.sum(np.square(np.asarray(ways - way[None], np.float64)), axis=1)
+            expected = nats[0] - special.logsumexp(nats[1:]) + np.log(32)
+            np.testing.assert_allclose(paid[t, b], L * expected, rtol=2e-3, atol=2e-3)
+            count += 1
+    assert count > 50
+
+
+def test_a_change_of_ds_actions_costs_its_square(task, model, walk):
+    changed = walked(Practising(SLED, OPTIONS, dataclasses.replace(PRACTICE, kl_weight=3.0), model))
+    policy, params = fresh(task)
+    params = practise.actor_of(model.params["decoder"], params)
+    actions, first, states = walk
+    obs = jnp.concatenate([first.obs[None], states.obs[:-1]])
+    ended = np.concatenate([np.zeros((1, 8), bool), np.asarray(states.truncated)[:-1]])  # whose obs is the last one's
+    change = jnp.sum(jnp.square(actions - jax.vmap(jax.vmap(partial(policy.mode, params)))(obs)), axis=-1)
+    np.testing.assert_allclose(changed[2].reward[~ended], (states.reward - 1.5 * change)[~ended], rtol=1e-4, atol=1e-3)
 
 
 @pytest.mark.parametrize("sides", [1, 4])

@@ -163,8 +163,9 @@ def test_values_of_tasks_whose_answer_is_known():
         assert np.sign(action[0]) == x
 
 
-def test_an_option_of_two_ticks_is_worth_the_discounted_reward_of_its_second():
-    config = as_arrays(dataclasses.replace(CONFIG, gamma=0.5))
+@pytest.mark.parametrize("scale", [1.0, 0.2])
+def test_an_option_of_two_ticks_is_worth_the_discounted_and_scaled_reward_of_its_second(scale):
+    config = as_arrays(dataclasses.replace(CONFIG, gamma=0.5, reward_scale=scale))
     env, executor = TwoStep(), Repeat(2)
     step = jax.jit(partial(sac.iterate, config, env, executor, 12))
     state = sac.init(config, env, executor, jax.random.key(0))
@@ -172,7 +173,7 @@ def test_an_option_of_two_ticks_is_worth_the_discounted_reward_of_its_second():
         state, metrics, _ = step(state)
     obs = (0.0 - state.obs_statistics.mean) / state.obs_statistics.std
     values = sac.make_critics(config).values(state.learnt.critics, obs[None], jnp.zeros((1, 1)))
-    np.testing.assert_allclose(values, 0.5, atol=0.03)
+    np.testing.assert_allclose(values, 0.5 * scale, atol=0.03)
     assert metrics["duration"] == 2.0
 
 
