@@ -25,8 +25,8 @@ class Views(struct.PyTreeNode):
     def directions(self, direction: Float[Array, " 2"]) -> Float[Array, "V 2"]:
         """Return a horizontal direction as each view sees it: equal sides lie around the vertical."""
         x, y = direction
-        angle = 2 * jnp.pi / len(self) * jnp.arange(len(self), dtype=jnp.float32)
-        c, s = jnp.cos(angle), jnp.sin(angle)
+        angle = 2 * np.pi / len(self) * np.arange(len(self))
+        c, s = np.cos(angle).astype(np.float32), np.sin(angle).astype(np.float32)
         return jnp.stack([c * x - s * y, s * x + c * y], axis=-1)
 
     def back(self, view: Int[Array, ""]) -> Int[Array, ""]:

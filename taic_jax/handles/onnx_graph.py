@@ -22,7 +22,7 @@ OPERATORS: dict[str, tuple[str, tuple[str, ...], dict[str, str]]] = {
     "logistic": ("Sigmoid", (), {}), "eq": ("Equal", (), {}), "ge": ("GreaterOrEqual", (), {}),
     "gt": ("Greater", (), {}), "lt": ("Less", (), {}), "squeeze": ("Squeeze", ("dimensions",), {}),
     "reshape": ("Reshape", ("new_sizes",), {}), "slice": ("Slice", ("start_indices", "limit_indices"), {}),
-    "split": ("Split", ("sizes",), {"axis": "axis"}), "concatenate": ("Concat", (), {"axis": "dimension"}),
+    "split": ("Split", ("sizes",), {"axis": "axis"}), "concatenate": ("Concat", (), {"axis": "dimension"}), "transpose": ("Transpose", (), {"perm": "permutation"}),
 }  # fmt: skip
 
 
@@ -98,8 +98,9 @@ class _Graph:
         """Add an equation whose parameters are axes and shapes."""
         params = equation.params
         match equation.primitive.name:
-            case "reduce_sum":
-                return self.add("ReduceSum", [*inputs, self.constant(params["axes"])], keepdims=0)
+            case "reduce_sum" | "reduce_max" as kind:
+                operator = {"reduce_sum": "ReduceSum", "reduce_max": "ReduceMax"}[kind]
+                return self.add(operator, [*inputs, self.constant(params["axes"])], keepdims=0)
             case "argmax":
                 place = self.add("ArgMax", inputs, axis=params["axes"][0], keepdims=0)
                 return self.add("Cast", place, to=helper.np_dtype_to_tensor_dtype(params["index_dtype"]))

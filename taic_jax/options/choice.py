@@ -23,5 +23,5 @@ def leading(
     size = model.networks.encoder.option_size
     codes = jnp.asarray(np.random.default_rng(0).standard_normal((MENU, size)), jnp.float32)
     gain = model.views.directions(frame.turned(way, state)) @ jax.vmap(model.way)(codes).T
-    best = jnp.argmax(gain).astype(jnp.int32)
-    return codes[best % MENU], best // MENU
+    view = jnp.argmax(jnp.max(gain, axis=1)).astype(jnp.int32)
+    return codes[jnp.argmax(gain[view])], view
