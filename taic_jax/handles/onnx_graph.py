@@ -22,7 +22,8 @@ OPERATORS: dict[str, tuple[str, tuple[str, ...], dict[str, str]]] = {
     "logistic": ("Sigmoid", (), {}), "eq": ("Equal", (), {}), "ge": ("GreaterOrEqual", (), {}),
     "gt": ("Greater", (), {}), "lt": ("Less", (), {}), "squeeze": ("Squeeze", ("dimensions",), {}),
     "reshape": ("Reshape", ("new_sizes",), {}), "slice": ("Slice", ("start_indices", "limit_indices"), {}),
-    "split": ("Split", ("sizes",), {"axis": "axis"}), "concatenate": ("Concat", (), {"axis": "dimension"}), "transpose": ("Transpose", (), {"perm": "permutation"}),
+    "split": ("Split", ("sizes",), {"axis": "axis"}), "concatenate": ("Concat", (), {"axis": "dimension"}),
+    "transpose": ("Transpose", (), {"perm": "permutation"}),
 }  # fmt: skip
 
 

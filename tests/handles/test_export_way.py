@@ -1,4 +1,4 @@
-"""The exported tick of an agent that chooses ways: it chooses the codes and sides, and gives the actions, of the agent."""
+"""The exported tick of an agent that chooses ways: it chooses codes and sides, and gives actions, as the agent does."""
 
 import jax
 import jax.numpy as jnp
