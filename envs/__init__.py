@@ -100,7 +100,7 @@ def make_env(
       model: MJCF and rules of the running robots: `brax`, or `gym` for Gymnasium's own.
       body: of the ant, alone or in an arena: `gym`, or `hiro`, which is weaker and slower.
       contacts: of `ant` with the ground: `feet`, or `body`, as in the arenas.
-      goal: of an arena: `fixed`, `near` in the maze, or `uniform` while training.
+      goal: of an arena: `fixed`, `near` in the maze, or `uniform` or `mixed` while training.
       change_after: episodes after which the room of `nav2d` changes; 0 for never.
 
     Raises:

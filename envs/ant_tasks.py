@@ -23,6 +23,7 @@ SUCCESS_RADIUS = 5.0  # m, of HIRO
 # Ticks of one direction of `AntHeadings`, and its greatest angle to the x axis in rad: the body's views cover the rest.
 HOLD, SPREAD = 60, math.pi / 4
 PATIENCE = 40  # ticks on the back after which an arena cuts an episode of training
+DRAWN = {"uniform": 1.0, "mixed": 0.5}  # share of training's episodes whose goal is drawn
 GOALS = 16  # candidates for a random goal, of which the first is taken where an ant can be
 
 
@@ -127,7 +128,7 @@ class AntArena(Locomotion):
     Args:
       body: of the ant, see `with_body`; options learnt on an `ant` of the same body apply.
       goal: `fixed`; `near`, if the arena has one; or, as in HIRO's maze, `uniform` in training, over all places where
-        an ant can be, and fixed in evaluation.
+        an ant can be, and fixed in evaluation; `mixed` draws it in half of the episodes.
 
     Raises:
       UnknownNameError: there is no such body or goal.
@@ -136,12 +137,12 @@ class AntArena(Locomotion):
     def __init__(
         self, name: str, arena: Arena, body: str, goal: str = "fixed", backend: str = "auto", num_threads: int = 0
     ):
-        goals = ("fixed", *(("near",) if arena.near_goal else ()), "uniform")
+        goals = ("fixed", *(("near",) if arena.near_goal else ()), *DRAWN)
         if goal not in goals:
             raise UnknownNameError("goal", goal, goals)
         if goal == "near":
             arena = dataclasses.replace(arena, goal=arena.near_goal)
-        self.arena, self.uniform_goal = arena, goal == "uniform"
+        self.arena, self.drawn = arena, DRAWN.get(goal, 0.0)
         self.patience: int | None = PATIENCE
         robot = with_contacts(with_body(ROBOTS["brax"]["ant"], body), "body")
         super().__init__(name, robot, backend, num_threads)
@@ -151,7 +152,7 @@ class AntArena(Locomotion):
     def evaluated(self) -> "AntArena":
         """This arena with its fixed goal, and whole episodes."""
         arena = copy.copy(self)
-        arena.uniform_goal, arena.patience = False, None
+        arena.drawn, arena.patience = 0.0, None
         return arena
 
     @property
@@ -174,11 +175,13 @@ class AntArena(Locomotion):
         """Start near the origin with Gym's noise, the block at its place."""
         key_body, key_goal = jax.random.split(key)
         state = super().reset(key_body)
-        if not self.uniform_goal:
+        if not self.drawn:
             return state
+        key_goal, key_drawn = jax.random.split(key_goal)
         low, high = jnp.array(self.arena.room).reshape(2, 2)
         places = jax.random.uniform(key_goal, (GOALS, 2), minval=low, maxval=high)
         place = places[jnp.argmax(jax.vmap(partial(is_open, self.arena))(places))]
+        place = jnp.where(jax.random.bernoulli(key_drawn, self.drawn), place, state.physics.goal[:2])
         physics = state.physics.replace(goal=state.physics.goal.at[:2].set(place))
         physics = physics.replace(closest=self._distance(physics))
         return state.replace(physics=physics, obs=self._observe(physics))

@@ -51,9 +51,9 @@ class EnvConfig:
     """Ant of ant, ant_headings and the arenas: Gym's, or HIRO's, which is weaker and acts half as often."""
     contacts: Literal["feet", "body"] = "feet"
     """Contacts of ant with the ground: those of its feet alone, or of its whole body, as in the arenas."""
-    goal: Literal["fixed", "near", "uniform"] = "fixed"
+    goal: Literal["fixed", "near", "uniform", "mixed"] = "fixed"
     """Goal of an arena: behind its obstacles; in ant_maze at the end of the first corridor; or drawn in each episode of
-    training, and behind the obstacles in evaluation."""
+    training, or in half of them, and behind the obstacles in evaluation."""
     change_after: Natural = 0
     """Episodes of each environment after which the room of nav2d changes; 0 for never."""
 

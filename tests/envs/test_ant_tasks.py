@@ -1,37 +1,18 @@
 """The turning ant, and the ants in HIRO's arenas: geometry, rewards, observations and contacts."""
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from ants import placed, start, task
 
-from taic_jax.envs import AntArena, AutoReset, UnknownNameError, make_env
+from taic_jax.envs import AutoReset, UnknownNameError, make_env
 from taic_jax.envs.ant_tasks import heading, wrapped
-from taic_jax.envs.arenas import PUSH, outside
+from taic_jax.envs.arenas import outside
 from taic_jax.envs.third_party import third_party
 
 ARENAS = ("ant_maze", "ant_push", "ant_fall")
-
-
-@functools.cache
-def task(name: str, **options):
-    """Return the task on MuJoCo's C engine, and its jitted functions over a batch."""
-    env = make_env(name, "mujoco", **options)
-    return env, jax.jit(jax.vmap(env.reset)), jax.jit(jax.vmap(env.step))
-
-
-def start(name: str, num: int = 2, **options):
-    return task(name, **options)[1](jax.random.split(jax.random.key(0), num))
-
-
-def placed(state, where):
-    """Put the torsos there, and stop them."""
-    physics = state.physics
-    qpos = physics.qpos.at[:, : len(where[0])].set(jnp.array(where))
-    return state.replace(physics=physics.replace(qpos=qpos, qvel=jnp.zeros_like(physics.qvel)))
 
 
 def yaw_quaternion(yaw):
@@ -160,37 +141,6 @@ def test_standing_still_returns_the_distance_every_tick(name, total):
     assert state.truncated.all() and not state.terminated.any() and env.episode_length == 1000
 
 
-def test_uniform_goals_fill_the_maze_and_are_observed():
-    state = start("ant_maze", 2000, goal="uniform")
-    goal = np.asarray(state.physics.goal)
-    assert goal.min() >= -4 and goal.max() <= 20
-    in_the_bar = (goal[:, 0] < 12) & (goal[:, 1] > 4) & (goal[:, 1] < 12)
-    assert not in_the_bar.any()
-    # Two corridors of 24 x 8 m, and what joins them, 8 x 8 m.
-    np.testing.assert_allclose((goal[:, 0] > 12).mean(), 3 / 7, atol=0.04)
-    np.testing.assert_allclose((goal[:, 1] < 4).mean(), 3 / 7, atol=0.04)
-    np.testing.assert_allclose(state.obs[:, 29:31], goal - state.physics.qpos[:, :2], atol=1e-5)
-    np.testing.assert_allclose(
-        state.physics.closest, np.linalg.norm(goal - state.physics.qpos[:, :2], axis=1), rtol=1e-5
-    )
-    evaluated = jax.jit(jax.vmap(AutoReset(task("ant_maze", goal="uniform")[0]).evaluated.reset))
-    np.testing.assert_array_equal(evaluated(jax.random.split(jax.random.key(1), 3)).physics.goal, [(0, 16)] * 3)
-
-
-def test_near_goal_is_straight_ahead_and_the_fixed_one_behind_a_wall():
-    """Walls between start and goal, and what is paid for standing at the goal and at the start."""
-    for goal, expected, hidden in (("near", (16.0, 0.0), False), ("fixed", (0.0, 16.0), True)):
-        env, _, step = task("ant_maze", goal=goal)
-        assert env.arena.goal == expected
-        way = np.zeros((100, env.model.nq)) + np.linspace(0, 1, 100)[:, None] * np.resize((*expected, 0), env.model.nq)
-        assert (outside(env.arena, way) > 0) == hidden
-        state = step(placed(start("ant_maze", 2, goal=goal), [[*expected, 0.55], [0, 0, 0.55]]), jnp.zeros((2, 8)))
-        np.testing.assert_allclose(state.reward, [0, -16], atol=0.1)
-        np.testing.assert_array_equal(state.metrics["success"], [1, 0])
-    with pytest.raises(UnknownNameError, match="goal"):
-        AntArena("ant_push", PUSH, "gym", goal="near")
-
-
 @pytest.mark.parametrize("name", ["ant", "ant_maze"])
 def test_hiros_body_is_weaker_and_slower(name):
     env = task(name, body="hiro")[0]
@@ -297,33 +247,3 @@ def test_random_ants_stay_inside_and_blocks_within_their_limits(name):
     keys = jax.random.split(jax.random.key(1), 300)
     qpos = np.asarray(jax.jit(lambda s: jax.lax.scan(tick, s, keys)[1])(state))
     assert outside(env.arena, qpos) == 0 and np.isfinite(qpos).all()
-
-
-@pytest.mark.parametrize(("name", "height"), [("ant_push", None), ("ant_fall", 4.5)])
-def test_drawn_goals_are_where_an_ant_can_be(name, height):
-    """Of the push: not in its three solids. Of the fall: on the two platforms, at their height."""
-    goal = np.asarray(start(name, 500, goal="uniform").physics.goal)
-    arena = task(name)[0].arena
-    x, y = goal[:, 0], goal[:, 1]
-    within = [(x > a) & (x < c) & (y > b) & (y < d) for a, b, c, d in arena.solids]
-    if height is None:
-        assert goal.shape[1] == 2 and not np.any(within)
-        assert min(((x < -4) & (y < 12)).mean(), ((x > 4) & (y > 4)).mean(), (y > 12).mean()) > 0.05
-    else:
-        assert np.all(goal[:, 2] == height) and np.all(within[0] | within[1]) and min(w.mean() for w in within) > 0.2
-
-
-def test_an_ant_on_its_back_is_cut_after_40_ticks_in_training_alone():
-    for training in (True, False):
-        env = make_env("ant_maze", "mujoco")
-        env = env if training else env.evaluated
-        step = jax.jit(jax.vmap(env.step))
-        state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 2))
-        over = state.physics.qpos.at[0, 3:7].set(jnp.array([0.0, 1.0, 0.0, 0.0])).at[0, 2].set(0.6)
-        state = state.replace(physics=state.physics.replace(qpos=over))
-        cut = []
-        for _ in range(41):
-            state = step(state, jnp.zeros((2, 8)))
-            cut.append(np.asarray(state.truncated))
-        assert not np.any(cut[:39]) and not np.any(state.terminated)
-        assert np.asarray(cut)[39].tolist() == [training, False]
