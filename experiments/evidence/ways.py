@@ -31,14 +31,14 @@ def draw_navigation(compass: Compass, paths: Mapping[str, tuple[Arena, np.ndarra
 
 
 def _draw_rose(axes: Axes, compass: Compass) -> None:
-    """Draw where each code leads, m/s; codes that overturn every tenth ant or more are red."""
+    """Draw where each option leads, m/s, seen as it is chosen; those that overturn a tenth of the ants are red."""
     risky = np.asarray(compass.overturned) >= 0.1
     for chosen, colour, label in ((~risky, BLUE, "upright"), (risky, RED, "overturns a tenth or more")):
         x, y = np.asarray(compass.velocity)[chosen].T
         axes.quiver(0 * x, 0 * y, x, y, angles="xy", scale_units="xy", scale=1, color=colour, width=0.004, label=label)
     reach = 1.1 * max(float(np.abs(compass.velocity).max()), 0.1)
-    axes.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal", xlabel="m/s ahead", ylabel="m/s to the left")
-    axes.set_title("where each code leads")
+    axes.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal", xlabel="m/s", ylabel="m/s")
+    axes.set_title("where each option leads")
     axes.legend(loc="lower left", fontsize=8)
 
 
