@@ -14,7 +14,7 @@ from taic_jax.artifacts.models import load_options, save_options
 from taic_jax.config import ConfigError, OptionsConfig
 from taic_jax.config.checks import validate
 from taic_jax.envs import make_env
-from taic_jax.options.choice import MENU
+from taic_jax.options.choice import menu
 from taic_jax.options.dataset import Experience
 from taic_jax.options.execution import make_executor
 from taic_jax.options.learning import learn
@@ -54,23 +54,30 @@ def test_views_turn_directions_as_they_turn_velocities(env):
 
 @pytest.mark.parametrize("yaw", [0.0, 2.5])
 def test_a_way_chooses_the_side_and_the_code_that_lead_along_it(env, executor, monkeypatch, yaw):
-    """By a P that says that a code leads to the left of ahead by half its first entry in rad."""
-    monkeypatch.setattr(OptionModel, "way", lambda _, code: jnp.stack([jnp.cos(code[0] / 2), jnp.sin(code[0] / 2)]))
+    """By a P that says that a code leads to the left of ahead by its first entry in rad."""
+    monkeypatch.setattr(OptionModel, "way", lambda _, code: jnp.stack([jnp.cos(code[0]), jnp.sin(code[0])]))
     assert executor.option_size == 2
     for angle in np.radians([-170, -100, -40, -10, 0, 30, 60, 120]):
         way = 3.0 * jnp.array([np.cos(angle + yaw), np.sin(angle + yaw)])
         running = executor.start(way, facing(env, yaw))
         # View k sees the world turned to the left by k quarters.
         seen = (angle + int(running.view) * np.pi / 2 + np.pi) % (2 * np.pi) - np.pi
-        assert abs(seen - float(running.option[0]) / 2) < 0.15
+        assert abs(seen - float(running.option[0])) < 0.15
 
 
 def test_among_codes_that_lead_the_same_way_the_farthest_is_chosen(env, executor, monkeypatch):
     monkeypatch.setattr(OptionModel, "way", lambda _, code: jnp.stack([2.0 + code[1], 0.0 * code[1]]))
     running = executor.start(jnp.array([1.0, 0.0]), facing(env, 0.0))
-    menu = np.random.default_rng(0).standard_normal((MENU, 2))
-    np.testing.assert_allclose(running.option, menu[np.argmax(menu[:, 1])], rtol=1e-6)
+    codes = menu(2)
+    np.testing.assert_allclose(running.option, codes[np.argmax(codes[:, 1])], rtol=1e-6)
     assert int(running.view) == 0
+
+
+def test_the_menu_is_the_middle_of_the_prior():
+    """Of four dimensions a quarter of the prior lies within 1.39, the root of a chi-squared quantile."""
+    codes = menu(4)
+    assert codes.shape == (64, 4) and 1.2 < np.linalg.norm(codes, axis=1).max() < 1.55
+    np.testing.assert_allclose(codes.mean(axis=0), 0.0, atol=0.3)
 
 
 def test_the_way_of_a_code_is_ps_prediction_from_the_mean_state(env, executor):
