@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 from pathlib import Path
 
 import jax
@@ -25,8 +26,9 @@ def test_an_agent_returns_as_its_card_says(name):
     result = jax.jit(lambda agent, key: evaluate(handle.env, agent, key, 32, 0.0))(
         handle.agents[TAIC][0], jax.random.key(9)
     )
-    values = [card["return_mean_option"][method] for method in (TAIC, "flat")]
-    assert f"| `{name}` | {values[0]:,.0f} | {values[1]:,.0f} |" in PAGE.read_text()
+    returns = card["return_mean_option"]  # without those of flat PPO if the collector has another task
+    values = [f"{returns[method]:,.0f}" if method in returns else "" for method in (TAIC, "flat")]
+    assert re.search(rf"\| `{name}` \| {values[0]} \| ?{values[1]} \|", PAGE.read_text())
     assert card["task"] == handle.config.env.name and set(handle.agents) == {TAIC, "collect"}
     assert result["return"] == pytest.approx(card["return_mean_option"][TAIC], rel=0.3)
 
