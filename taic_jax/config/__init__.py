@@ -169,8 +169,7 @@ class PractiseConfig:
     hold: int = 3
     """Most options for which a code from the prior is held."""
     reward: Literal["direction", "information"] = "direction"
-    """Reward besides being upright: the speed in a code's direction; or, at an option's end, how much better its code
-    than others predicts its way (eq. 8): the mutual information of code and way."""
+    """Reward: the speed in a code's direction; or the mutual information of code and way (eq. 8)."""
     speed: Positive = 1.5
     """Speed in m/s in a code's direction beyond which more earns nothing: fast ants fall."""
     control_cost: float = 0.1
