@@ -17,8 +17,6 @@ from taic_jax.envs.errors import UnknownNameError
 from taic_jax.options.model import OptionModel
 from taic_jax.summary import replay_sizes
 
-SIDES = 4  # equal sides of a body whose options choose the view
-
 
 def make_envs(config: Config) -> tuple[Env, Env]:
     """Return the task and the environment of stage collect.

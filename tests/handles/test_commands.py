@@ -123,9 +123,8 @@ def test_the_strip_shows_the_options_of_past_ticks_and_marks_decisions():
 def test_a_ways_arrow_points_where_it_leads():
     """White pixels of the corner lie towards the arrow's tip: right, up, left and down."""
     ways = np.array([[3.0, 0.0], [0.0, 0.1], [-1.0, 0.0], [0.0, -2.0]])
-    plain, frames = np.zeros((4, 240, 320, 3), np.uint8), np.zeros((4, 240, 320, 3), np.uint8)
-    frames = with_compass(frames, ways)
-    assert not frames[:, 60:].any() and not frames[:, :, :260].any() and frames.shape == plain.shape
+    frames = with_compass(np.zeros((4, 240, 320, 3), np.uint8), ways)
+    assert not frames[:, 60:].any() and not frames[:, :, :260].any() and frames.shape == (4, 240, 320, 3)
     for frame, (x, y) in zip(frames, ways, strict=True):
         rows, columns = np.nonzero(frame[8:48, 272:312].any(axis=-1))  # within the circle
         lean = np.array([columns.mean() - 19.5, 19.5 - rows.mean()])
