@@ -17,7 +17,7 @@ from taic_jax.envs.base import Goals, PhysicsState, State
 from taic_jax.envs.errors import UnknownNameError
 from taic_jax.envs.locomotion import Locomotion, Outcome
 from taic_jax.envs.rendering import render_mujoco
-from taic_jax.envs.robots import ROBOTS, compile_spec, initial_qpos, load_spec, with_body, with_contacts
+from taic_jax.envs.robots import ROBOTS, compile_spec, load_spec, with_body, with_contacts
 
 SUCCESS_RADIUS = 5.0  # m, of HIRO
 # Ticks of one direction of `AntHeadings`, and its greatest angle to the x axis in rad: the body's views cover the rest.
@@ -81,6 +81,9 @@ class AntHeadings(Locomotion):
         tick = jax.random.randint(key_tick, (), 0, HOLD)
         physics = state.physics.replace(directions=directions, tick=tick)
         return state.replace(physics=physics, obs=self._observe(physics))
+
+    def _start(self) -> Float[np.ndarray, " nq"]:
+        return clear_of_the_floor(super()._start(), self.model)
 
     def _begin(self, physics: PhysicsState) -> HeadingsState:
         return HeadingsState(**vars(physics), directions=jnp.zeros(self._num_directions), tick=jnp.zeros((), jnp.int32))
@@ -207,11 +210,7 @@ class AntArena(Locomotion):
         return compile_spec(spec)
 
     def _start(self) -> Float[np.ndarray, " nq"]:
-        qpos = self.model.qpos0.copy()
-        if not self.robot.start_in_default_pose:
-            qpos[:ANT_QPOS] = initial_qpos(self.robot, self.model)
-            qpos[2] += self.arena.ground
-        return qpos
+        return clear_of_the_floor(super()._start(), self.model)
 
     def _begin(self, physics: PhysicsState) -> ArenaState:
         """Take the noise from the block, and start the record of distances."""
@@ -250,6 +249,14 @@ class AntArena(Locomotion):
         flags = {"success": distance < SUCCESS_RADIUS, "upside_down": upside_down(after.qpos[3:7])}
         metrics = {name: flag.astype(jnp.float32) for name, flag in flags.items()}
         return -distance, metrics | {"distance": distance, "closest_approach": after.closest}
+
+
+def clear_of_the_floor(qpos: Float[np.ndarray, " n"], model: mujoco.MjModel) -> Float[np.ndarray, " nq"]:
+    """Return an ant's pose at the height of the model's default pose, and whatever else moves in that pose.
+
+    At Brax's height of 0.55 m Gym's noise puts legs into the floor, which throws the ant up, and every seventh over.
+    """
+    return np.concatenate([qpos[:2], model.qpos0[2:3], qpos[3:ANT_QPOS], model.qpos0[ANT_QPOS:]])
 
 
 def heading(quaternion: Float[Array, " 4"]) -> Float[Array, ""]:

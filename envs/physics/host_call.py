@@ -6,6 +6,7 @@ cache. Here a function is a handler of XLA's foreign function interface. ctypes 
 structures, and XLA refuses a version that it no longer serves.
 """
 
+import atexit
 import ctypes
 import functools
 import math
@@ -67,6 +68,16 @@ class HostCall:
         except Exception as error:  # raised here it would only be printed
             return _as_error(frame[_API], f"{type(error).__name__}: {error}")
         return None
+
+
+@atexit.register
+def wait_for_programs() -> None:
+    """Wait until every array is there: a program that calls into Python while that shuts down crashes or hangs."""
+    for array in jax.live_arrays():
+        try:
+            array.block_until_ready()
+        except RuntimeError:  # deleted, or its program has failed
+            continue
 
 
 @functools.cache

@@ -8,7 +8,7 @@ import pytest
 from ants import placed, start, task
 
 from taic_jax.envs import AutoReset, UnknownNameError, make_env
-from taic_jax.envs.ant_tasks import heading, wrapped
+from taic_jax.envs.ant_tasks import heading, upside_down, wrapped
 from taic_jax.envs.arenas import outside
 from taic_jax.envs.third_party import third_party
 
@@ -61,7 +61,7 @@ def test_turning_ant_observes_and_ends_like_the_ant():
 
 @pytest.mark.parametrize(
     ("name", "goal", "height", "size"),
-    [("ant_maze", (0, 16), 0.55, 31), ("ant_push", (0, 19), 0.55, 34), ("ant_fall", (0, 27, 4.5), 4.55, 35)],
+    [("ant_maze", (0, 16), 0.75, 31), ("ant_push", (0, 19), 0.75, 34), ("ant_fall", (0, 27, 4.5), 4.75, 35)],
 )
 def test_observation_is_the_ants_then_position_goal_and_block(name, goal, height, size):
     env = task(name)[0]
@@ -80,6 +80,15 @@ def test_observation_is_the_ants_then_position_goal_and_block(name, goal, height
         block = {"ant_push": (0, 8, 2), "ant_fall": (8, 8, 6)}[name]
         np.testing.assert_allclose(obs[:, ends:], np.array(block) - torso, atol=1e-5)
         assert (state.physics.qpos[:, 15:] == 0).all() and (state.physics.qvel[:, 14:] == 0).all(), "no noise"
+
+
+@pytest.mark.parametrize("name", ["ant_headings", *ARENAS])
+def test_no_ant_is_thrown_over_by_its_start(name):
+    _, _, step = task(name)
+    state = start(name, 64)
+    for _ in range(40):
+        state = step(state, jnp.zeros((64, 8)))
+        assert not jax.vmap(upside_down)(state.physics.qpos[:, 3:7]).any()
 
 
 def test_block_is_where_its_joints_put_it():

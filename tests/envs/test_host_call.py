@@ -67,3 +67,17 @@ def test_the_known_answer_is_asked_for_while_a_program_is_traced_too(monkeypatch
     answers = []
     jax.jit(lambda x: (answers.append(host_calls_work.__wrapped__()), x)[1])(1.0)
     assert answers == [True]
+
+
+def test_a_script_may_end_while_its_programs_run():
+    """Two hundred ticks of 64 hoppers are dispatched, and nothing waits for them."""
+    code = """
+import jax, jax.numpy as jnp
+from taic_jax.envs import make_env
+env = make_env("hopper", "mujoco")
+state, step = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 64)), jax.jit(jax.vmap(env.step))
+for _ in range(200):
+    state = step(state, jnp.zeros((64, 3)))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
