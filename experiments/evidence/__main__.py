@@ -19,6 +19,7 @@ from taic_jax.command_line import tell
 from taic_jax.config import Shard
 from taic_jax.experiments.evidence.measures import example_space, measure_run_paths, measure_spaces
 from taic_jax.experiments.evidence.plan import PATHS, SPACES, Cell, Key, all_cells
+from taic_jax.experiments.evidence.steering import navigation_of
 from taic_jax.experiments.evidence.table import TABLE, TableError, append_row, config_hash, read_table, row_of
 from taic_jax.pipeline import collect, make_envs, run_pipeline, take_over, train_baseline
 from taic_jax.runtime.devices import Devices, make_devices, open_devices
@@ -77,6 +78,9 @@ def make_row(cell: Cell, run_dir: Path, method: str, stage: str) -> dict[str, An
     if method == PATHS:
         row = row_of(folder, run_dir, PATHS, "train") | {"curves": {}, "grid": [], "ticks": 0}
         return row | measure_run_paths(folder)
+    if cell.figure == "gate":
+        row = row_of(folder, run_dir, method, "train") | {"curves": {}, "grid": [], "ticks": 0}
+        return row | {"numbers": {name: list(values) for name, values in navigation_of(folder).items()}}
     row = row_of(folder, run_dir, method, stage)
     if cell.figure in ("6", "7") and stage == "train":
         row["numbers"] |= measure_spaces(folder)

@@ -11,13 +11,15 @@ from taic_jax.config import Config, FineTuneConfig, OptionsConfig, replace
 from taic_jax.config.files import load_config
 
 ROBOTS = ("half_cheetah", "ant", "hopper", "walker2d")
-TRANSFERS = ("ant_turn", "ant_maze", "ant_push", "ant_fall")
+TURN, ARENAS = "ant_turn", ("ant_maze", "ant_push", "ant_fall")
 RECOVERY = "nav2d"
 # Interactions with the task; flat PPO of method long has twice as many.
-TICKS = {"ant": 2_000_000} | dict.fromkeys(TRANSFERS, 3_000_000)
+TICKS = {"ant": 2_000_000, TURN: 3_000_000, "ant_maze": 1_000_000, "ant_push": 3_000_000, "ant_fall": 3_000_000}
 MILLION = 1_000_000
 CAPACITY = MILLION  # Ticks of experience; of Ant's two million the second half, which has all its windows.
 FIRST_SEED = 200
+FRESH_SEED, FRESH_SEEDS, PAIR = 1000, 10, 2  # Of the gate and the arenas; a run has two of these seeds.
+LEFT_OUT_SEEDS = 6  # Those of them for which a part of the options is left out.
 PATHS = "paths"  # Method of the row with the paths of the room's options.
 
 # In open loop P is surprised far more often in execution than on its training data: with a quantile of the latter,
@@ -58,10 +60,13 @@ FLAT = {"strong": "collect", "weak": "collect", "long": "collect", "repeat": "re
 """Methods without options, and the stage that trains each."""
 # Beside them, for the table of options: every rule in closed loop, and one without constraints.
 OTHERS = dict.fromkeys(("output-closed-both", "predict-closed-both", "fixed-closed-none"), ("", 10))
-# Of figure 8: the method's name, and of figure 5c: the stage of the run that trains it.
+# Of figure 8 on the turning ant and in the arenas, and of figure 5c: the method's name, and the stage that trains it.
 TRANSFERRED = {"open": ("options of Ant, open loop", "train"), "closed": ("options of Ant, closed loop", "train"),
                "tuned": ("options of Ant, fine-tuned", "train"), "flat": ("flat PPO", "flat"),
                "transfer": ("flat PPO from Ant's policy", "transfer")}  # fmt: skip
+CARRIED = {"steering": ("options that steer, SAC", "train"),
+           "total": ("flat PPO, as many interactions in all", "flat"),
+           "walker": ("flat PPO from a walking ant's policy", "transfer")}  # fmt: skip
 RECOVERING = {"options": ("options", "train"), "flat": ("flat PPO", "flat")}
 
 Key = tuple[str, str, int]  # Task, method and first seed, which identify a row.
@@ -146,20 +151,11 @@ def robots(task: str, run_dir: Path, chunk: int = 10) -> list[Cell]:
     return cells
 
 
-# As the rows of the arenas were made, by PPO over the options of `ant_steering`; the presets have changed since.
-ARENA = {"collect.ppo.gamma": 0.999, "train.ppo.gamma": 0.999, "train.fine_tune.std": 0.1}
-MAZE = {"ant_maze": {"env.goal": "uniform", "collect.ppo.num_envs": 64, "collect.ppo.rollout_length": 250}}
-
-
-def transfers(task: str, run_dir: Path, seeds: int = 10) -> list[Cell]:
-    """Return the runs of figure 8 on one task; policy and experience are of the ant's run `ant/source`.
-
-    That is as long as the ant's own runs: after half the ticks the ant is too slow to cross an arena in an episode.
-    """
-    ant, turn = load_config("ant"), load_config("transfer_ant_turn")
-    preset = turn if task == "ant_turn" else replace_all(turn, ARENA | {"env.name": task} | MAZE.get(task, {}))
+def turning(run_dir: Path, seeds: int = 10) -> list[Cell]:
+    """Return the runs of figure 8 on the turning ant; policy and experience are of the ant's run `ant/source`."""
+    ant, preset = load_config("ant"), load_config("transfer_ant_turn")
     runs = {name: str(run_dir / name) for name in ("ant/source", "ant/source-open", "ant/source-steering")}
-    source = one_iteration(replace(ant, "collect.ticks", TICKS["ant"]), seeds)
+    source = one_iteration(replace(ant, "collect.ticks", TICKS["ant"]), FIRST_SEED, seeds)
     from_source = {"options.experience": (runs["ant/source"],)}
     open_loop = with_options(source, "ant", "open").options
     steering = load_config("ant_steering").options
@@ -178,20 +174,74 @@ def transfers(task: str, run_dir: Path, seeds: int = 10) -> list[Cell]:
         "closed": closed,
     }
     return sources + [
-        Cell(f"{task}/{name}", replace_all(config, fields), {name: TRANSFERRED[name][1]}, "8")
+        Cell(f"{TURN}/{name}", replace_all(config, fields), {name: TRANSFERRED[name][1]}, "8")
         for name, fields in methods.items()
     ]
 
 
-def one_iteration(config: Config, seeds: int) -> Config:
+# A part of the options that steer is left out, or another in its place. Practice needs codes that say where they lead.
+BY_CODE: dict[str, Any] = {"options.choose": "code", "practise.ticks": 0}
+GATES: dict[str, dict[str, Any]] = {
+    "practice": {"practise.ticks": 0},
+    "heading": BY_CODE | {"options.frame": "world"},
+    "way": BY_CODE | {"options.way_weight": 0},
+    "constraints": {"options.lambda_pred": 0.0, "options.lambda_adv": 0.0},
+    "learning": {"options.steps": 0},
+    "headings": {"collect.env": ""},
+    "contacts": {"collect.env": "", "env.contacts": "feet"},
+    "direction": {"practise.reward": "information"},
+}
+OWN_EXPERIENCE = ("headings", "contacts")
+
+
+def gates(run_dir: Path, seed: int) -> list[Cell]:
+    """Return the runs whose options a navigator tries, of two seeds: `ant/steering`, and without a part of it each."""
+    config = one_iteration(load_config("steering"), seed, PAIR)
+    name = f"ant/steering-{seed}"
+    cells = [Cell(name, config, {"gate": "options"}, "gate")]
+    for part, fields in GATES.items() if seed < FRESH_SEED + LEFT_OUT_SEEDS else ():
+        own = {} if part in OWN_EXPERIENCE else {"options.experience": (str(run_dir / name),)}
+        without = f"without-{part}"
+        cells.append(Cell(f"ant/{without}-{seed}", replace_all(config, own | fields), {without: "options"}, "gate"))
+    return cells
+
+
+def carried(run_dir: Path, seed: int) -> list[Cell]:
+    """Return the runs of figure 8 in the arenas, of two seeds: options that steer, and flat PPO.
+
+    Flat PPO has the interactions of the options' experience and practice as well, on the task or on walking ahead.
+    """
+    steering = load_config("steering")
+    pretraining = steering.collect.ticks + steering.practise.ticks
+    walker = one_iteration(replace(load_config("ant"), "collect.ticks", pretraining), seed, PAIR)
+    walker = replace_all(walker, {"env.contacts": "body", "options.steps": 0})  # its options are not used
+    cells = [Cell(f"ant/walker-{seed}", walker, {}, "8")]
+    for task in ARENAS:
+        preset, ticks = load_config(f"transfer_{task}"), TICKS[task]
+        config = replace_all(preset, PLAIN | SCORED | {"seed": seed, "seeds": PAIR, "train.ticks": ticks})
+        flat: dict[str, Any] = {"train.learner": "ppo"}  # no policy over options is trained
+        methods = {
+            "steering": {"options.source": str(run_dir / f"ant/steering-{seed}")},
+            "total": flat
+            | {"train.baselines": ("flat",), "options": OptionsConfig(), "train.ticks": ticks + pretraining},
+            "walker": flat
+            | {"train.baselines": ("transfer",), "options": walker.options}
+            | {"options.source": str(run_dir / f"ant/walker-{seed}")},
+        }
+        for name, fields in methods.items():
+            cells.append(Cell(f"{task}/{name}-{seed}", replace_all(config, fields), {name: CARRIED[name][1]}, "8"))
+    return cells
+
+
+def one_iteration(config: Config, seed: int, seeds: int) -> Config:
     """Return the config of a source run, whose policy over options is not used: it trains for one iteration."""
     ticks = config.train.ppo.num_envs * config.train.ppo.rollout_length
-    return replace_all(config, PLAIN | {"train.ticks": ticks, "seed": FIRST_SEED, "seeds": seeds})
+    return replace_all(config, PLAIN | {"train.ticks": ticks, "seed": seed, "seeds": seeds})
 
 
 def recovery(run_dir: Path, seeds: int = 50) -> list[Cell]:
     """Return the runs of figure 5: options of the room, and recovery after it changes."""
-    source = one_iteration(load_config("nav2d"), seeds)
+    source = one_iteration(load_config("nav2d"), FIRST_SEED, seeds)
     fields = {"options.experience": (str(run_dir / "nav2d/source"),), "seed": FIRST_SEED, "seeds": seeds}
     change = replace_all(load_config("nav2d_change"), fields)
     stages = {method: stage for method, (_, stage) in RECOVERING.items()}
@@ -203,6 +253,10 @@ def all_cells(run_dir: Path) -> list[Cell]:
     cells = {cell.name: cell for cell in recovery(run_dir)}
     for task in ROBOTS:
         cells |= {cell.name: cell for cell in robots(task, run_dir)}
-    for task in TRANSFERS:  # the ant's own are the same for all
-        cells |= {cell.name: cell for cell in transfers(task, run_dir)}
-    return [cell._replace(config=replace(cell.config, "collect.capacity", CAPACITY)) for cell in cells.values()]
+    cells |= {cell.name: cell for cell in turning(run_dir)}
+    cells = {
+        name: cell._replace(config=replace(cell.config, "collect.capacity", CAPACITY)) for name, cell in cells.items()
+    }
+    for seed in range(FRESH_SEED, FRESH_SEED + FRESH_SEEDS, PAIR):
+        cells |= {cell.name: cell for cell in (*gates(run_dir, seed), *carried(run_dir, seed))}
+    return list(cells.values())

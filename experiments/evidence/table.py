@@ -126,9 +126,12 @@ def row_of(folder: Path, run_dir: Path, method: str, stage: str) -> dict[str, An
 
 
 def pretraining_of(config: Config) -> int:
-    """Return the interactions of the experience or policy that a run starts from, another's or its own."""
-    source = config.options.source or next(iter(config.options.experience), "")
-    return (RunFolder(Path(source)).config() if source else config).collect.ticks
+    """Return the interactions of the experience, the practice or the policy that a run starts from."""
+    if config.options.source:
+        return pretraining_of(RunFolder(Path(config.options.source)).config())
+    experience = next(iter(config.options.experience), "")
+    collected = RunFolder(Path(experience)).config() if experience else config
+    return collected.collect.ticks + config.practise.ticks
 
 
 def curves_of(rows: Sequence[Row], stage: str, grid: np.ndarray) -> dict[str, list]:

@@ -1,4 +1,4 @@
-"""Draw one of the paper's figures, or write the table of all kinds of options.
+"""Draw one of the paper's figures, or write the table of all kinds of options, or of the gate.
 
 python -m taic_jax.experiments.figures 7
 python -m taic_jax.experiments.figures 7 --methods strong long fixed-closed-both-tuned \
@@ -15,10 +15,14 @@ from taic_jax.experiments.figures.figure5 import Figure5ab, Figure5c
 from taic_jax.experiments.figures.figure6 import Figure6
 from taic_jax.experiments.figures.figure7 import Figure7
 from taic_jax.experiments.figures.figure8 import Figure8
+from taic_jax.experiments.figures.gate_table import GateTable
 from taic_jax.experiments.figures.option_table import OptionTable
 
 PROGRAM = "python -m taic_jax.experiments.figures"
-COMMANDS = {kind.number: kind for kind in (Figure5ab, Figure5c, Figure6, Figure7, Figure8)} | {"table": OptionTable}
+COMMANDS = {kind.number: kind for kind in (Figure5ab, Figure5c, Figure6, Figure7, Figure8)} | {
+    "table": OptionTable,
+    "gate": GateTable,
+}
 
 
 def main(args: Sequence[str] | None = None) -> int:

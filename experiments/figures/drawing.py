@@ -77,9 +77,9 @@ def read_methods(rows: Rows, task: str, minima: Mapping[str, int]) -> Methods:
     return {name: evidence.select(rows, task, name, seeds) for name, seeds in minima.items() if name in present}
 
 
-def read_panels(figure: Figure, rows: Rows, tasks: Sequence[str], minima: Mapping[str, int]) -> dict[str, Methods]:
-    """Return the methods of each task; raise `TableError` if there are none."""
-    panels = {task: read_methods(rows, task, minima) for task in tasks}
+def read_panels(figure: Figure, rows: Rows, minima: Mapping[str, Mapping[str, int]]) -> dict[str, Methods]:
+    """Return the methods of each task, each with its fewest seeds; raise `TableError` if there are none."""
+    panels = {task: read_methods(rows, task, methods) for task, methods in minima.items()}
     if not any(panels.values()):
         raise figure.no_row("python -m taic_jax.experiments.evidence")
     return panels
@@ -108,18 +108,23 @@ class Strip(NamedTuple):
 
 
 def draw_panels(
-    panels: dict[str, Methods], strips: Sequence[Strip], styles: Mapping[str, Style], height: float, ncols: int
+    panels: dict[str, Methods],
+    strips: Sequence[Strip],
+    styles: Sequence[Mapping[str, Style]],
+    height: float,
+    ncols: int,
 ) -> tuple[Picture, np.ndarray]:
     """Draw a column per task and a row per strip above a legend of `ncols` columns; return the figure and its axes.
 
-    Remarks on missing or mixed rows stand below a task's name.
+    `styles` are those of each task's methods. Remarks on missing or mixed rows stand below a task's name.
     """
     figure, grid = plt.subplots(len(strips), len(panels), figsize=(4.1 * len(panels) + 0.4, height), squeeze=False)
     for column, (task, methods) in enumerate(panels.items()):
+        own = styles[column]
         for axes, strip in zip(grid[:, column], strips, strict=True):
-            draw_strip(axes, strip, methods, styles)
-        remarks = [f"{styles[name][1]}: {remark}" for name, runs in methods.items() for remark in runs.remarks]
-        missing = [label for name, (_, label, _) in styles.items() if name not in methods]
+            draw_strip(axes, strip, methods, own)
+        remarks = [f"{own[name][1]}: {remark}" for name, runs in methods.items() for remark in runs.remarks]
+        missing = [label for name, (_, label, _) in own.items() if name not in methods]
         mark(grid[0, column], task, remarks + (["missing: " + ", ".join(missing)] if missing else []))
     grid[0, 0].set_ylabel("return of an episode")
     curves = {x: y for axes in grid[0] for y, x in zip(*axes.get_legend_handles_labels(), strict=True)}

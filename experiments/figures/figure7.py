@@ -37,7 +37,8 @@ class Figure7(Figure):
     def draw(self, rows: Rows) -> tuple[Picture, Rows]:
         if unknown := set(self.methods) - set(METHODS):
             raise TableError(f"--methods: expected some of {', '.join(METHODS)}, got {min(unknown)}")
-        panels = read_panels(self, rows, self.tasks, {name: METHODS[name][1] for name in self.methods})
+        minima = {name: METHODS[name][1] for name in self.methods}
+        panels = read_panels(self, rows, dict.fromkeys(self.tasks, minima))
         return picture(panels, self.methods), numbers_of(panels, numbers)
 
 
@@ -75,6 +76,6 @@ def numbers(runs: EvidenceRows, methods: Methods) -> Rows:
 def picture(panels: dict[str, Methods], methods: Sequence[str]) -> Picture:
     """Draw a column per task: over the task's ticks alone, and over these and the ticks of pre-training."""
     styles = {name: (COLOURS[name], METHODS[name][0], name in FLAT) for name in methods}
-    figure, grid = draw_panels(panels, (Strip(), Strip(pretrained=True)), styles, 7.6, len(panels))
+    figure, grid = draw_panels(panels, (Strip(), Strip(pretrained=True)), [styles] * len(panels), 7.6, len(panels))
     grid[1, 0].set_ylabel("return of an episode")
     return figure

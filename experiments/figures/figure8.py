@@ -1,4 +1,4 @@
-"""Figure 8: options of Ant, as they are or fine-tuned, on its harder tasks, and the numbers of claim C3.
+"""Figure 8: options of Ant on its harder tasks, and the numbers of claim C3.
 
 A row of numbers is of one measure of one method. Success is a place within 5 m of the goal at the last tick of an
 episode (HIRO's definition); a seed's success is its share of evaluation episodes under its mean options.
@@ -13,15 +13,17 @@ import numpy as np
 from matplotlib.figure import Figure as Picture
 from scipy import stats
 
-from taic_jax.experiments.evidence.plan import TRANSFERRED, TRANSFERS
+from taic_jax.experiments.evidence.plan import ARENAS, CARRIED, TRANSFERRED, TURN
 from taic_jax.experiments.evidence.table import BOUNDS, EvidenceRows, with_improvement, with_interval
 from taic_jax.experiments.figures import drawing
 from taic_jax.experiments.figures.drawing import Figure, Methods, Rows, Strip, draw_panels, numbers_of, read_panels
 
 SEEDS = 10
 COLOURS = {"open": drawing.ORANGE, "closed": drawing.RED, "tuned": drawing.PURPLE, "flat": drawing.BLACK,
-           "transfer": drawing.BLUE}  # fmt: skip
-BASELINES = ("flat", "transfer")
+           "transfer": drawing.BLUE, "steering": drawing.GREEN, "total": drawing.BLACK,
+           "walker": drawing.BLUE}  # fmt: skip
+METHODS = {TURN: TRANSFERRED} | dict.fromkeys(ARENAS, CARRIED)
+BASELINES = ("flat", "transfer", "total", "walker")
 MEASURES = ("first", "last", "mean_option", "final/success", "final/closest_approach", "final/upside_down")
 LATE = 5  # Last points of a curve whose mean is a measure of training.
 CURVES = {"return": "training/return", "mean/success": "training/success"}
@@ -40,10 +42,10 @@ class Figure8(Figure):
         "p_holm", "seeds_at_goal", "per_seed", "remarks",
     )  # fmt: skip
 
-    tasks: tuple[str, ...] = TRANSFERS  # Panels.
+    tasks: tuple[str, ...] = (TURN, *ARENAS)  # Panels.
 
     def draw(self, rows: Rows) -> tuple[Picture, Rows]:
-        panels = read_panels(self, rows, self.tasks, dict.fromkeys(TRANSFERRED, SEEDS))
+        panels = read_panels(self, rows, {task: dict.fromkeys(METHODS[task], SEEDS) for task in self.tasks})
         return picture(panels), numbers_of(panels, numbers)
 
 
@@ -87,7 +89,10 @@ def picture(panels: dict[str, Methods]) -> Picture:
     """Draw a column per task: the return, and the share of ticks at the goal if there is one."""
     goals = any("mean/success" in runs.curves for methods in panels.values() for runs in methods.values())
     strips = (Strip(), Strip("mean/success"))[: 1 + goals]
-    styles = {name: (COLOURS[name], label, name in BASELINES) for name, (label, _) in TRANSFERRED.items()}
+    styles = [
+        {name: (COLOURS[name], label, name in BASELINES) for name, (label, _) in METHODS[task].items()}
+        for task in panels
+    ]
     figure, grid = draw_panels(panels, strips, styles, 3.0 * len(strips) + 1.0, min(3, 2 * len(panels) - 1))
     if goals:
         grid[1, 1 % len(panels)].set_ylabel("share of ticks within 5 m of the goal")

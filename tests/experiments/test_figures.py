@@ -8,6 +8,7 @@ import pytest
 from written_runs import TICKS, made_row, written
 
 from taic_jax.experiments.evidence.measures import AFTER
+from taic_jax.experiments.evidence.plan import ARENAS
 from taic_jax.experiments.figures import drawing, figure6
 from taic_jax.experiments.figures.__main__ import COMMANDS, main
 
@@ -99,13 +100,13 @@ def test_figure_6_draws_what_the_table_holds_and_marks_the_rest(table, tmp_path,
 def test_figure_8_compares_every_measure_with_both_baselines(table, tmp_path):
     """Options return 10 to 14: more than flat PPO's 0 to 4, less than 20 to 24 of flat PPO from Ant's policy."""
     levels = {"flat": 0.0, "transfer": 20.0, "closed": 10.0, "open": 12.0}
-    rows = [made_row("ant_maze", method, 0, 5, level) for method, level in levels.items()]
+    rows = [made_row("ant_turn", method, 0, 5, level) for method, level in levels.items()]
     for row, share in zip(rows, (0.0, 1.0, 0.4, 0.4), strict=True):
         row["numbers"] |= {"final/success": [share] * 4 + [1.0], "final/closest_approach": [share] * 5}
         row["numbers"]["final/upside_down"] = [1 - share] * 5
         row["curves"]["mean/success"] = np.outer([0, 0, 0, 1, 1], np.arange(50) == 20).tolist()
     out = tmp_path / "figure8.png"
-    assert main(["8", "--table", written(table, *rows), "--out", str(out), "--tasks", "ant_maze", "ant_turn"]) == 0
+    assert main(["8", "--table", written(table, *rows), "--out", str(out), "--tasks", "ant_turn", "ant_maze"]) == 0
     assert out.stat().st_size > 10_000
     with out.with_suffix(".csv").open() as file:
         numbers = {(row["method"], row["measure"]): row for row in csv.DictReader(file)}
@@ -131,6 +132,19 @@ def test_figure_8_compares_every_measure_with_both_baselines(table, tmp_path):
     assert closed["first"]["p_holm"] == "" and closed["final/success"]["mean"] == "0.52"
 
 
+def test_figure_8_compares_options_that_steer_with_flat_ppo_of_as_many_interactions(table, tmp_path):
+    levels = {"steering": 10.0, "total": 0.0, "walker": 20.0, "closed": 99.0}
+    rows = [made_row("ant_push", method, 0, 10, level) for method, level in levels.items()]
+    out = tmp_path / "figure8.png"
+    assert main(["8", "--table", written(table, *rows), "--out", str(out), "--tasks", "ant_push"]) == 0
+    with out.with_suffix(".csv").open() as file:
+        numbers = {(row["method"], row["measure"]): row for row in csv.DictReader(file)}
+    assert {method for method, _ in numbers} == levels.keys() - {"closed"}, "a row of an earlier plan is not drawn"
+    ours = numbers["steering", "last"]
+    assert (ours["improvement_on_total"], ours["improvement_on_walker"], ours["improvement_on_flat"]) == ("1", "0", "")
+    assert ours["remarks"] == "" and ours["p_holm"] != "" and numbers["total", "last"]["p_holm"] == ""
+
+
 def test_colours_of_near_points_are_alike():
     points = np.array([[0.0, 0.0], [0.1, 0.1], [5.0, 9.0], [5.1, 0.2]])
     colours = figure6.as_colours(points)
@@ -143,3 +157,22 @@ def test_the_style_of_figures_is_theirs_alone():
     before = dict(plt.rcParams)
     drawing.styled(lambda: None)()
     assert dict(plt.rcParams) == before and not before["figure.constrained_layout.use"]
+
+
+def test_the_gate_counts_the_models_that_pass(table, tmp_path):
+    """Of three models the second overturns ants before the block, and the third does not cross the chasm."""
+    good = {"codes/speed": 1.3, "codes/agreement": 0.97}
+    good |= {
+        f"{name}/{measure}": x for name in ARENAS for measure, x in (("success", 0.8), ("overturned_per_1000", 0.2))
+    }
+    models = [good, good | {"ant_push/overturned_per_1000": 0.3}, good | {"ant_fall/success": 0.7}]
+    numbers = {name: [model[name] for model in models] for name in good}
+    row = made_row("ant", "gate", 1000, 3, 0.0, numbers=numbers, curves={}, grid=[])
+    out = tmp_path / "gate.csv"
+    assert main(["gate", "--table", written(table, row), "--out", str(out)]) == 0
+    with out.open() as file:
+        lines = {line["measure"]: line for line in csv.DictReader(file)}
+    assert len(lines) == 2 + 2 * len(ARENAS) + 2 and lines["codes/speed"]["remarks"] == "3 of 10 seeds"
+    assert lines["reach"]["per_seed"] == "1 1 0" and lines["pass"]["per_seed"] == "1 0 0"
+    assert float(lines["ant_fall/success"]["low"]) >= 0.7 and lines["ant_fall/success"]["iqm"] != ""
+    assert main(["gate", "--table", str(tmp_path / "none.jsonl"), "--out", str(tmp_path / "no.csv")]) == 2
