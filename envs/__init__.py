@@ -17,13 +17,14 @@ if sys.platform == "linux" and "DISPLAY" not in os.environ and ctypes.util.find_
     os.environ.setdefault("MUJOCO_GL", "egl")
 
 from taic_jax.envs.adapters import BRAX_PREFIX, GYMNAX_PREFIX, PLAYGROUND_PREFIX, BraxEnv, GymnaxEnv, PlaygroundEnv
-from taic_jax.envs.ant_tasks import AntArena, AntHeadings, AntTurn
+from taic_jax.envs.ant_tasks import AntArena, AntTurn
 from taic_jax.envs.arenas import FALL, MAZE, PUSH
 from taic_jax.envs.base import Env, PhysicsState, State
 from taic_jax.envs.contract import check_contract
 from taic_jax.envs.custom import load_custom
 from taic_jax.envs.errors import ContractError, EnvOptionError, MissingExtraError, RenderingError, UnknownNameError
 from taic_jax.envs.grid import FourRooms
+from taic_jax.envs.headings import AntHeadings, CheetahHeadings
 from taic_jax.envs.locomotion import Locomotion
 from taic_jax.envs.navigation import Navigation
 from taic_jax.envs.physics import BACKENDS
@@ -31,10 +32,10 @@ from taic_jax.envs.robots import ROBOTS, with_body, with_contacts
 from taic_jax.envs.wrappers import AutoReset, TimeLimit, Wrapper
 
 __all__ = [
-    "AntArena", "AntHeadings", "AntTurn", "AutoReset", "BraxEnv", "ContractError", "Env", "EnvOptionError",
-    "FourRooms", "GymnaxEnv", "Locomotion", "MissingExtraError", "Navigation", "PhysicsState", "PlaygroundEnv",
-    "RenderingError", "State", "TimeLimit", "UnknownNameError", "Wrapper", "check_contract", "environment_names",
-    "environment_options", "make_env",
+    "AntArena", "AntHeadings", "AntTurn", "AutoReset", "BraxEnv", "CheetahHeadings", "ContractError", "Env",
+    "EnvOptionError", "FourRooms", "GymnaxEnv", "Locomotion", "MissingExtraError", "Navigation", "PhysicsState",
+    "PlaygroundEnv", "RenderingError", "State", "TimeLimit", "UnknownNameError", "Wrapper", "check_contract",
+    "environment_names", "environment_options", "make_env",
 ]  # fmt: skip
 
 
@@ -61,6 +62,7 @@ _TASKS = {
     "four_rooms_random": _Task(partial(FourRooms, random_ends=True), has_engine=False),
     **{name: _Task(partial(_make_robot, name), ("model",)) for name in ROBOTS["brax"]},
     "ant": _Task(partial(_make_robot, "ant"), ("model", "body", "contacts")),  # alone of the robots it has two bodies
+    "half_cheetah_headings": _Task(CheetahHeadings),
     "ant_headings": _Task(AntHeadings, ("body",)),
     "ant_turn": _Task(partial(AntTurn, "ant_turn", ROBOTS["brax"]["ant"])),
     "ant_maze": _Task(partial(AntArena, "ant_maze", MAZE), ("body", "goal")),

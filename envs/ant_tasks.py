@@ -2,7 +2,6 @@
 
 import copy
 import dataclasses
-import math
 from functools import partial
 
 import jax
@@ -20,8 +19,6 @@ from taic_jax.envs.rendering import render_mujoco
 from taic_jax.envs.robots import ROBOTS, compile_spec, load_spec, with_body, with_contacts
 
 SUCCESS_RADIUS = 5.0  # m, of HIRO
-# Ticks of one direction of `AntHeadings`, and its greatest angle to the x axis in rad: the body's views cover the rest.
-HOLD, SPREAD = 60, math.pi / 4
 PATIENCE = 40  # ticks on the back after which an arena cuts an episode of training
 DRAWN = {"uniform": 1.0, "mixed": 0.5}  # share of training's episodes whose goal is drawn
 GOALS = 16  # candidates for a random goal, of which the first is taken where an ant can be
@@ -46,69 +43,6 @@ class AntTurn(Locomotion):
     def _progress(self, before: TurningState, after: TurningState) -> Outcome:
         rate = 2 * jnp.pi * (after.turns - before.turns) / self.dt
         return rate, {"yaw_rate": rate, "turns": after.turns}
-
-
-class HeadingsState(PhysicsState):
-    """The simulation, and the directions to go in one after another, each for `HOLD` ticks."""
-
-    directions: Array  # [N] rad in the world, left is positive
-    tick: Array  # [] int32; it starts at random, so that environments turn at different times
-
-
-class AntHeadings(Locomotion):
-    """Go in a direction and do not fall: experience for options that steer.
-
-    The direction is within 45 degrees of the x axis, and is drawn anew every three seconds. The reward of a tick is the
-    speed in m/s along it, less half the speed across it and the control cost, plus the upward part of the torso's own
-    axis: 1 if it is level. Only an ant on its back ends the episode.
-
-    Observation: the 27 entries of `ant`; then, seen from the ant's heading, the direction [2] and the torso's
-    horizontal velocity [2].
-    """
-
-    def __init__(self, body: str = "gym", backend: str = "auto", num_threads: int = 0):
-        ant = dataclasses.replace(ROBOTS["brax"]["ant"], control_cost=0.1)  # at 0.5 it hardly dares to walk
-        robot = with_contacts(with_body(ant, body), "body")
-        self._num_directions = math.ceil(robot.episode_length / HOLD) + 1
-        super().__init__("ant_headings", robot, backend, num_threads)
-        self.proprioceptive_size = ANT_QPOS - robot.num_unobserved + ANT_QVEL
-
-    def reset(self, key: Key[Array, ""]) -> State:
-        """Start with Gym's noise, and draw all directions of the episode."""
-        key_body, key_directions, key_tick = jax.random.split(key, 3)
-        state = super().reset(key_body)
-        directions = jax.random.uniform(key_directions, (self._num_directions,), minval=-SPREAD, maxval=SPREAD)
-        tick = jax.random.randint(key_tick, (), 0, HOLD)
-        physics = state.physics.replace(directions=directions, tick=tick)
-        return state.replace(physics=physics, obs=self._observe(physics))
-
-    def _start(self) -> Float[np.ndarray, " nq"]:
-        return clear_of_the_floor(super()._start(), self.model)
-
-    def _begin(self, physics: PhysicsState) -> HeadingsState:
-        return HeadingsState(**vars(physics), directions=jnp.zeros(self._num_directions), tick=jnp.zeros((), jnp.int32))
-
-    def _advance(self, before: HeadingsState, after: HeadingsState) -> HeadingsState:
-        return after.replace(tick=before.tick + 1)
-
-    def _observe(self, physics: HeadingsState) -> Float[Array, " S"]:
-        angle, yaw = self._direction(physics), heading(physics.qpos[3:7])
-        seen = turned(jnp.stack([unit(angle), physics.qvel[:2]]), -yaw)
-        return jnp.concatenate([super()._observe(physics), *seen])
-
-    def _direction(self, physics: HeadingsState) -> Float[Array, ""]:
-        return physics.directions[physics.tick // HOLD]
-
-    def _is_healthy(self, physics: PhysicsState) -> Bool[Array, ""]:
-        return ~upside_down(physics.qpos[3:7])
-
-    def _judge(self, before: HeadingsState, after: HeadingsState, action: Float[Array, " A"]) -> Outcome:
-        velocity = (after.qpos[:2] - before.qpos[:2]) / self.dt
-        along, across = turned(velocity, -self._direction(before))
-        control_cost = self.robot.control_cost * jnp.sum(action**2)
-        reward = along - 0.5 * jnp.abs(across) + upright(after.qpos[3:7]) - control_cost
-        metrics = {"speed_along": along, "speed_across": jnp.abs(across), "upright": upright(after.qpos[3:7])}
-        return reward, metrics
 
 
 class ArenaState(PhysicsState):

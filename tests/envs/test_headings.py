@@ -1,4 +1,4 @@
-"""The ant that goes where it should, and the contacts of its body."""
+"""Robots that go where they should, and the contacts of the ant's body."""
 
 import jax
 import jax.numpy as jnp
@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from taic_jax.envs import UnknownNameError, make_env
-from taic_jax.envs.ant_tasks import HOLD, SPREAD, heading, turned, unit
+from taic_jax.envs.ant_tasks import heading, turned, unit
+from taic_jax.envs.headings import HOLD, SPREAD
 
 KEYS = jax.random.split(jax.random.key(0), 16)
 
@@ -65,6 +66,25 @@ def test_direction_and_velocity_are_seen_from_the_heading(walk):
         direction = unit(state.physics.directions[state.physics.tick // HOLD])
         np.testing.assert_allclose(obs[27:29], turned(direction, jnp.float32(-yaw)), atol=1e-5)
         np.testing.assert_allclose(obs[29:], [3, 0], atol=1e-5)
+
+
+def test_the_cheetah_is_paid_for_going_forward_or_backward_as_it_is_told():
+    """Its reward is half_cheetah's, with the sign of the speed that the observation's last entry has."""
+    env, plain = make_env("half_cheetah_headings", "mujoco"), make_env("half_cheetah", "mujoco")
+    assert (env.observation_size, env.proprioceptive_size, env.proprioception) == (18, 17, "half_cheetah")
+    actions = jax.random.uniform(jax.random.key(1), (130, 16, 6), minval=-1.0)
+    state, step = jax.jit(jax.vmap(env.reset))(KEYS), jax.jit(jax.vmap(env.step))
+    judge, seen = jax.jit(jax.vmap(plain.env._judge)), []
+    for action in actions:
+        sign, before = np.asarray(state.obs[:, 17]), state.physics
+        np.testing.assert_array_equal(state.obs[:, :17], jax.vmap(plain.env._observe)(before))
+        state = step(state, action)
+        speed = np.asarray(state.physics.qpos[:, 0] - before.qpos[:, 0]) / env.dt
+        expected = judge(before, state.physics, action)[0] + (sign - 1) * speed
+        np.testing.assert_allclose(state.reward, expected, atol=1e-4)
+        seen.append(sign)
+    changes = np.diff(seen, axis=0) != 0
+    assert set(np.unique(seen)) == {-1.0, 1.0} and 8 < changes.sum() < 32, "two draws in 130 ticks, half of them new"
 
 
 def test_the_body_on_open_ground_moves_as_in_the_arenas():
