@@ -2,7 +2,6 @@
 
 import copy
 import dataclasses
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -20,8 +19,8 @@ from taic_jax.envs.robots import ROBOTS, compile_spec, load_spec, with_body, wit
 
 SUCCESS_RADIUS = 5.0  # m, of HIRO
 PATIENCE = 40  # ticks on the back after which an arena cuts an episode of training
-DRAWN = {"uniform": 1.0, "mixed": 0.5}  # share of training's episodes whose goal is drawn
-GOALS = 16  # candidates for a random goal, of which the first is taken where an ant can be
+CANDIDATES = 32  # for a place that is drawn, of which the first is taken where an ant can be
+BODY_WIDTH = 1.2  # m from walls at a start that is drawn
 
 
 class TurningState(PhysicsState):
@@ -65,7 +64,7 @@ class AntArena(Locomotion):
     Args:
       body: of the ant, see `with_body`; options learnt on an `ant` of the same body apply.
       goal: `fixed`; `near`, if the arena has one; or, as in HIRO's maze, `uniform` in training, over all places where
-        an ant can be, and fixed in evaluation; `mixed` draws it in half of the episodes.
+        an ant can be, and fixed in evaluation; `mixed` draws it in half of the episodes, and the start in half.
 
     Raises:
       UnknownNameError: there is no such body or goal.
@@ -74,12 +73,12 @@ class AntArena(Locomotion):
     def __init__(
         self, name: str, arena: Arena, body: str, goal: str = "fixed", backend: str = "auto", num_threads: int = 0
     ):
-        goals = ("fixed", *(("near",) if arena.near_goal else ()), *DRAWN)
+        goals = ("fixed", *(("near",) if arena.near_goal else ()), "uniform", "mixed")
         if goal not in goals:
             raise UnknownNameError("goal", goal, goals)
         if goal == "near":
             arena = dataclasses.replace(arena, goal=arena.near_goal)
-        self.arena, self.drawn = arena, DRAWN.get(goal, 0.0)
+        self.arena, self.goal = arena, goal
         self.patience: int | None = PATIENCE
         robot = with_contacts(with_body(ROBOTS["brax"]["ant"], body), "body")
         super().__init__(name, robot, backend, num_threads)
@@ -89,7 +88,7 @@ class AntArena(Locomotion):
     def evaluated(self) -> "AntArena":
         """This arena with its fixed goal, and whole episodes."""
         arena = copy.copy(self)
-        arena.drawn, arena.patience = 0.0, None
+        arena.goal, arena.patience = "fixed", None
         return arena
 
     @property
@@ -109,19 +108,27 @@ class AntArena(Locomotion):
         return Goals(size, achieved, aim, reward)
 
     def reset(self, key: Key[Array, ""]) -> State:
-        """Start near the origin with Gym's noise, the block at its place."""
+        """Start near the origin with Gym's noise, the block at its place; or in training where it is drawn."""
         key_body, key_goal = jax.random.split(key)
         state = super().reset(key_body)
-        if not self.drawn:
+        if self.goal not in ("uniform", "mixed"):
             return state
-        key_goal, key_drawn = jax.random.split(key_goal)
-        low, high = jnp.array(self.arena.room).reshape(2, 2)
-        places = jax.random.uniform(key_goal, (GOALS, 2), minval=low, maxval=high)
-        place = places[jnp.argmax(jax.vmap(partial(is_open, self.arena))(places))]
-        place = jnp.where(jax.random.bernoulli(key_drawn, self.drawn), place, state.physics.goal[:2])
+        key_goal, key_start, key_drawn = jax.random.split(key_goal, 3)
+        place, start = self._draw(key_goal), self._draw(key_start, BODY_WIDTH) + state.physics.qpos[:2]
+        if self.goal == "mixed":
+            drawn = jax.random.bernoulli(key_drawn, 0.5, (2,))
+            place = jnp.where(drawn[0], place, state.physics.goal[:2])
+            qpos = state.physics.qpos.at[:2].set(jnp.where(drawn[1], start, state.physics.qpos[:2]))
+            state = state.replace(physics=state.physics.replace(qpos=qpos))
         physics = state.physics.replace(goal=state.physics.goal.at[:2].set(place))
         physics = physics.replace(closest=self._distance(physics))
         return state.replace(physics=physics, obs=self._observe(physics))
+
+    def _draw(self, key: Key[Array, ""], width: float = 0.0) -> Float[Array, " 2"]:
+        """Draw a place where an ant can be, or start."""
+        low, high = jnp.array(self.arena.room).reshape(2, 2)
+        places = jax.random.uniform(key, (CANDIDATES, 2), minval=low, maxval=high)
+        return places[jnp.argmax(jax.vmap(lambda place: is_open(self.arena, place, width))(places))]
 
     def step(self, state: State, action: Float[Array, " A"]) -> State:
         """Simulate one tick and measure the distance."""

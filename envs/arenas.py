@@ -5,6 +5,7 @@ block. The outer walls are four planes, the cheapest shape for collisions, and s
 """
 
 import dataclasses
+from collections.abc import Sequence
 
 import jax.numpy as jnp
 import mujoco
@@ -47,16 +48,19 @@ class Block:
     mass: float = 0.1  # kg; HIRO's 0.2 and 1 g go through walls at a steady push
 
 
+Box = tuple[float, float, float, float]  # x_low, y_low, x_high, y_high
+
+
 @dataclasses.dataclass(frozen=True)
 class Arena:
     """A room, in m, with the ant's start at the origin of x and y."""
 
-    room: tuple[float, float, float, float]  # x_low, y_low, x_high, y_high
-    solids: tuple[tuple[float, float, float, float], ...]  # likewise
+    room: Box
+    solids: tuple[Box, ...]
     goal: tuple[float, ...]  # 2 coordinates, or 3 where height counts
     near_goal: tuple[float, ...] | None = None  # one without obstacles before it
     # A way to the goal: the place to go to next from anywhere in a rectangle, the first that one is in.
-    ways: tuple[tuple[tuple[float, float, float, float], tuple[float, float]], ...] = ()
+    ways: tuple[tuple[Box, tuple[float, float]], ...] = ()
     ground: float = 0.0  # height of the ground on which the ant starts
     block: Block | None = None
 
@@ -117,11 +121,25 @@ def furnish(spec: mujoco.MjSpec, arena: Arena) -> None:
     _add_camera(spec, arena)
 
 
-def is_open(arena: Arena, place: Float[Array, " 2"]) -> Bool[Array, ""]:
-    """Return whether an ant can be at a place in the room: on a platform, or out of all solids."""
-    low, high = jnp.array(arena.solids).reshape(-1, 2, 2).swapaxes(0, 1)
-    within = jnp.any(jnp.all((low < place[None]) & (place[None] < high), axis=1))
-    return within if arena.ground else ~within
+def is_open(arena: Arena, place: Float[Array, " 2"], width: float = 0.0) -> Bool[Array, ""]:
+    """Return whether an ant can be at a place in the room: on a platform, or out of all solids.
+
+    With a `width` in m it can start there: it has this distance from walls, edges and the block.
+    """
+    there = _is_within(arena.solids, place, -width) if arena.ground else ~_is_within(arena.solids, place, width)
+    if not width:
+        return there
+    there &= _is_within((arena.room,), place, -width)
+    if arena.block:
+        (x, y, _), (half_x, half_y, _) = arena.block.centre, arena.block.half
+        there &= ~_is_within(((x - half_x, y - half_y, x + half_x, y + half_y),), place, width)
+    return there
+
+
+def _is_within(boxes: Sequence[Box], place: Float[Array, " 2"], margin: float) -> Bool[Array, ""]:
+    """Return whether a place is in one of some rectangles with this margin."""
+    low, high = jnp.array(boxes).reshape(-1, 2, 2).swapaxes(0, 1)
+    return jnp.any(jnp.all((low - margin < place[None]) & (place[None] < high + margin), axis=1))
 
 
 def outside(arena: Arena, qpos: Float[np.ndarray, "*batch nq"]) -> int:

@@ -55,9 +55,29 @@ def test_drawn_goals_are_where_an_ant_can_be(name, height):
         assert np.all(goal[:, 2] == height) and np.all(within[0] | within[1]) and min(w.mean() for w in within) > 0.2
 
 
-def test_mixed_goals_are_drawn_in_half_of_the_episodes():
-    goal = np.asarray(start("ant_push", 400, goal="mixed").physics.goal)
-    assert 0.4 < (goal == np.array([0.0, 19.0], np.float32)).all(axis=1).mean() < 0.6
+@pytest.mark.parametrize("name", ["ant_push", "ant_fall"])
+def test_mixed_goals_and_starts_are_drawn_in_half_of_the_episodes(name):
+    """And each without the other; a start has at least 1.1 m to walls, edges and the block, its noise included."""
+    state, arena = start(name, 400, goal="mixed"), task(name)[0].arena
+    drawn = (np.asarray(state.physics.goal) != np.array(arena.goal, np.float32)).any(axis=1)
+    place = np.asarray(state.physics.qpos[:, :2])
+    moved = np.abs(place).max(axis=1) > 0.11
+    assert 0.4 < drawn.mean() < 0.6 and 0.4 < moved.mean() < 0.6 and 0.15 < (drawn & moved).mean() < 0.35
+    np.testing.assert_allclose(state.obs[:, 27:29], place)
+    np.testing.assert_allclose(state.obs[:, 29:31], np.asarray(state.physics.goal)[:, :2] - place, atol=1e-5)
+
+    def gap(box):
+        low, high = np.array(box).reshape(2, 2)
+        return np.maximum(low - place, place - high).max(axis=1)  # negative inside
+
+    (x, y, _), (half_x, half_y, _) = arena.block.centre, arena.block.half
+    gaps = np.stack([gap(box) for box in arena.solids])
+    walls = -gaps.min(axis=0) if arena.ground else gaps.min(axis=0)
+    assert np.min(walls[moved]) > 1.09 and np.max(gap(arena.room)[moved]) < -1.09
+    assert gap((x - half_x, y - half_y, x + half_x, y + half_y))[moved].min() > 1.09
+    assert min(place[moved].min(axis=0)) < -2 and place[moved][:, 1].max() > arena.goal[1] - 3, "from end to end"
+    evaluated = jax.jit(jax.vmap(AutoReset(task(name, goal="mixed")[0]).evaluated.reset))
+    assert np.abs(evaluated(jax.random.split(jax.random.key(1), 50)).physics.qpos[:, :2]).max() < 0.11
 
 
 def test_an_ant_on_its_back_is_cut_after_40_ticks_in_training_alone():
