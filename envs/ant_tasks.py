@@ -70,6 +70,8 @@ class AntArena(Locomotion):
       UnknownNameError: there is no such body or goal.
     """
 
+    staggered = True
+
     def __init__(
         self, name: str, arena: Arena, body: str, goal: str = "fixed", backend: str = "auto", num_threads: int = 0
     ):

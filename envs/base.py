@@ -89,6 +89,7 @@ class Env(abc.ABC):
     episode_length: int  # ticks
     dt: float  # seconds a tick
     discrete: bool = False  # whether an action is one of A, instead of a vector in [-1, 1]^A
+    staggered: bool = False  # whether training begins at ticks apart, since the time limit alone ends episodes
 
     @property
     def views(self) -> Views:

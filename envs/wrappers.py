@@ -35,6 +35,11 @@ class Wrapper(Env):
         return self.env.discrete
 
     @property
+    def staggered(self) -> bool:
+        """Whether training of the inner environment begins at ticks apart."""
+        return self.env.staggered
+
+    @property
     def goals(self) -> Goals | None:
         """Goals of the inner environment."""
         return self.env.goals

@@ -82,7 +82,7 @@ def init(rule: Rule, config: ReplayConfig, env: Env, executor: Executor, key: Ke
         obs_statistics=normalize.init((env.observation_size,)),
         replay=init_replay(config.capacity, pending),
         pending=pending,
-        running=start(AutoReset(env), executor, config.num_envs, key_envs),
+        running=start(AutoReset(env), executor, config.num_envs, key_envs, env.staggered),
         owed=jnp.zeros(()),
         key=key,
         iteration=jnp.zeros((), jnp.int32),

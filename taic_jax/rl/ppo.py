@@ -53,7 +53,7 @@ def init(config: PPOConfig, env: Env, executor: Executor, key: Key[Array, ""]) -
         optimizer=make_optimizer(config).init(params),
         obs_statistics=normalize.init((env.observation_size,)),
         reward_scale=normalize.init_reward_scale(config.num_envs),
-        running=start(AutoReset(env), executor, config.num_envs, key_envs),
+        running=start(AutoReset(env), executor, config.num_envs, key_envs, env.staggered),
         key=key,
         iteration=jnp.zeros((), jnp.int32),
     )

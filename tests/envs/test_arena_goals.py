@@ -1,13 +1,18 @@
 """Goals of the arenas: where they are drawn, who draws them, and when an episode of training is cut."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from ants import placed, start, task
 
+from taic_jax.config import PPOConfig, SACConfig
 from taic_jax.envs import AntArena, AutoReset, UnknownNameError, make_env
 from taic_jax.envs.arenas import PUSH, outside
+from taic_jax.options.execution import IdentityExecutor
+from taic_jax.rl import ppo, sac
 
 
 def test_uniform_goals_fill_the_maze_and_are_observed():
@@ -94,3 +99,13 @@ def test_an_ant_on_its_back_is_cut_after_40_ticks_in_training_alone():
             cut.append(np.asarray(state.truncated))
         assert not np.any(cut[:39]) and not np.any(state.terminated)
         assert np.asarray(cut)[39].tolist() == [training, False]
+
+
+def test_training_begins_at_ticks_apart():
+    """Whatever the learner; an evaluated episode and a task that ends by itself begin at their first tick."""
+    configs = {ppo: PPOConfig(num_envs=8), sac: SACConfig(num_envs=8, capacity=64)}
+    for learner, config in configs.items():
+        for name, apart in (("ant_maze", True), ("ant_turn", False)):
+            init = jax.jit(partial(learner.init, config, task(name)[0], IdentityExecutor(8)))
+            ticks = np.asarray(init(jax.random.key(0)).running.env.tick)
+            assert (len(set(ticks.tolist())) > 4) == apart and (ticks.any() or not apart)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from probes import Counting, Repeat, assert_trees_equal
 
-from taic_jax.envs import AutoReset
+from taic_jax.envs import AutoReset, TimeLimit
 from taic_jax.options.execution import IdentityExecutor
 from taic_jax.rl.rollout import Rollout, RolloutCarry, count_durations, rollout, start
 
@@ -102,6 +102,21 @@ def test_returns_add_up_per_episode(counted):
 def test_no_return_before_an_episode_is_over():
     running, _ = run(Counting(END), Repeat(N), look, END - 1)
     assert np.isnan(running.last_return).all() and (running.episode_return == 21).all()
+
+
+def test_staggered_episodes_end_at_different_ticks_and_the_first_have_no_return():
+    env = AutoReset(TimeLimit(Counting(1000), 40))
+    running = start(env, Repeat(N), 16, jax.random.key(0), stagger=True)
+    first = np.asarray(running.env.tick)
+    assert first.min() >= 0 and first.max() < 40 and len(set(first.tolist())) > 8
+    _, ticks = jax.jit(partial(rollout, env, Repeat(N), look, length=90))(running, jax.random.key(1))
+    for b, tick in enumerate(first):
+        np.testing.assert_array_equal(np.flatnonzero(ticks.truncated[:, b]), np.arange(39 - tick, 90, 40))
+    done, total = np.asarray(ticks.truncated), np.asarray(ticks.episode_return)
+    whole = np.cumsum(done, axis=0) > 1
+    assert (total[done & whole] == 40 * 41 / 2).all() and np.isnan(
+        total[:, first > 0][~whole[:, first > 0] & done[:, first > 0]]
+    ).all()
 
 
 def test_two_rollouts_equal_one():
