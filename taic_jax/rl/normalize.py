@@ -17,7 +17,8 @@ Statistics = running_statistics.RunningStatisticsState
 """Mean and standard deviation of all data so far, with a 64-bit count."""
 
 
-CARRIED, CLIP = 1000, 10.0
+CARRIED = 100_000  # observations that carried statistics count as; a rollout of a tenth hardly moves them
+CLIP = 10.0
 
 
 def init(shape: tuple[int, ...] = ()) -> Statistics:
@@ -36,8 +37,8 @@ def identity(size: int) -> Statistics:
 def carry_over(statistics: Statistics, shared: int, size: int) -> Statistics:
     """Return statistics of `size` entries of which the first `shared` are those of another run.
 
-    They count as `CARRIED` observations, so that those of the new task soon outweigh them; the other entries start at
-    mean 0 and standard deviation 1.
+    They count as `CARRIED` observations: a policy would see the body anew if the first rollout outweighed them, and
+    entries of the task would never leave their mean of 0 and standard deviation of 1 if all observations counted.
     """
     source: Any = statistics
     mean = jnp.zeros(size).at[:shared].set(source.mean[:shared])
