@@ -4,7 +4,6 @@ if __name__ == "envs":  # would be a second copy of every class
     raise ImportError("this folder is the package `taic_jax.envs`; import it by that name")
 
 import ctypes.util
-import inspect
 import os
 import sys
 from collections.abc import Callable
@@ -55,6 +54,10 @@ def _make_robot(
     return Locomotion(name, with_contacts(with_body(ROBOTS[model][name], body), contacts), backend, num_threads)
 
 
+DEFAULTS: dict[str, str | int] = {
+    "pipeline": "spring", "model": "brax", "body": "gym", "contacts": "feet", "goal": "fixed", "change_after": 0,
+}  # fmt: skip
+"""Options of tasks."""
 _TASKS = {
     "nav2d": _Task(Navigation, ("change_after",), has_engine=False),
     "nav2d_random": _Task(partial(Navigation, random_ends=True), has_engine=False),
@@ -87,10 +90,7 @@ def environment_options(name: str) -> tuple[str, ...]:
     return _find(name).options
 
 
-def make_env(
-    name: str, backend: str = "auto", *, num_threads: int = 0, pipeline: str = "spring", model: str = "brax",
-    body: str = "gym", contacts: str = "feet", goal: str = "fixed", change_after: int = 0,
-) -> Env:  # fmt: skip
+def make_env(name: str, backend: str = "auto", *, num_threads: int = 0, **options: str | int) -> Env:
     """Make a task by name, with its time limit.
 
     Args:
@@ -98,6 +98,9 @@ def make_env(
         packages; `FILE.py:CLASS` or `MODULE:CLASS` for your own.
       backend: physics of the MuJoCo tasks, `auto`, `mujoco`, `mjx` or `warp` (see `physics.make_physics`).
       num_threads: threads of the `mujoco` backend; 0 takes one per physical core.
+      **options: those of the task (`environment_options`); a default is accepted by every task.
+
+    Options:
       pipeline: physics of `brax:NAME`: `spring`, `positional`, `generalized` or `mjx`.
       model: MJCF and rules of the running robots: `brax`, or `gym` for Gymnasium's own.
       body: of the ant, alone or in an arena: `gym`, or `hiro`, which is weaker and slower.
@@ -114,20 +117,11 @@ def make_env(
     task = _find(name)
     if backend not in BACKENDS:
         raise UnknownNameError("backend", backend, BACKENDS)
-    options = {
-        "pipeline": pipeline,
-        "model": model,
-        "body": body,
-        "contacts": contacts,
-        "goal": goal,
-        "change_after": change_after,
-    }
-    defaults = inspect.signature(make_env).parameters
     for option, value in options.items():
-        if option not in task.options and value != defaults[option].default:
+        if option not in task.options and value != DEFAULTS.get(option):
             raise EnvOptionError(name, option, value, task.options)
     engine = {"backend": backend, "num_threads": num_threads} if task.has_engine else {}
-    env = task.make(**{option: options[option] for option in task.options}, **engine)
+    env = task.make(**{option: options.get(option, DEFAULTS[option]) for option in task.options}, **engine)
     if name not in _TASKS:
         check_contract(env)
     return TimeLimit(env, env.episode_length)

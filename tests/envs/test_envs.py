@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 import importlib.util
-import inspect
 import subprocess
 import sys
 from pathlib import Path
@@ -132,18 +131,22 @@ def test_a_wrong_name_gets_one_line_with_the_nearest(given, hint):
             "env.goal: ant_headings has no such option, got 'uniform'; its options: body",
         ),
         ({"name": "ant_turn", "body": "hiro"}, "env.body: ant_turn has no such option, got 'hiro'; its options: none"),
+        (
+            {"name": "ant", "boddy": "gym"},
+            "env.boddy: ant has no such option, got 'gym'; its options: model, body, contacts",
+        ),
     ],
 )
 def test_an_option_of_another_task_is_refused(given, says):
     with pytest.raises(envs.EnvOptionError) as error:
         make_env(**given)
     assert str(error.value) == says
-    assert set(given) - {"name"} <= {"model", "goal", "body"} - set(envs.environment_options(given["name"]))
+    assert set(given) - {"name"} <= {"model", "goal", "body", "boddy"} - set(envs.environment_options(given["name"]))
 
 
 def test_the_config_has_the_options_of_make_env_with_their_defaults():
-    options = {name: parameter.default for name, parameter in inspect.signature(make_env).parameters.items()}
-    assert dataclasses.asdict(EnvConfig()) == options | {"name": "nav2d"}
+    own = {"name": "nav2d", "backend": "auto", "num_threads": 0}
+    assert dataclasses.asdict(EnvConfig()) == own | envs.DEFAULTS
     choices = {name: get_args(kind) for name, kind in get_type_hints(EnvConfig).items()}
     assert (choices["backend"], choices["model"], choices["body"]) == (BACKENDS, tuple(ROBOTS), BODIES)
 
