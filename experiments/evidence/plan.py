@@ -67,6 +67,8 @@ TRANSFERRED = {"open": ("options of Ant, open loop", "train"), "closed": ("optio
 CARRIED = {"steering": ("options that steer, SAC", "train"),
            "total": ("flat PPO, as many interactions in all", "flat"),
            "walker": ("flat PPO from a walking ant's policy", "transfer")}  # fmt: skip
+# Rows of an earlier plan, whose ants started in the floor: the table keeps them, no figure draws them.
+EARLIER = {(task, method) for task in ARENAS for method in TRANSFERRED}
 RECOVERING = {"options": ("options", "train"), "flat": ("flat PPO", "flat")}
 
 Key = tuple[str, str, int]  # Task, method and first seed, which identify a row.

@@ -52,8 +52,8 @@ class EnvConfig:
     contacts: Literal["feet", "body"] = "feet"
     """Contacts of ant with the ground: those of its feet alone, or of its whole body, as in the arenas."""
     goal: Literal["fixed", "near", "uniform", "mixed"] = "fixed"
-    """Goal of an arena: behind its obstacles; in ant_maze at the end of the first corridor; or in training drawn in each
-    episode (uniform), or in half of them, in half of which the start is drawn too (mixed)."""
+    """Goal of an arena: behind its obstacles; in ant_maze at the end of the first corridor; or drawn in each episode of
+    training (uniform), or in half of them, and the start in half of them, too (mixed)."""
     change_after: Natural = 0
     """Episodes of each environment after which the room of nav2d changes; 0 for never."""
 
