@@ -17,7 +17,7 @@ Statistics = running_statistics.RunningStatisticsState
 """Mean and standard deviation of all data so far, with a 64-bit count."""
 
 
-CARRIED = 100_000  # observations that carried statistics count as; a rollout of a tenth hardly moves them
+CARRIED = 100_000  # observations that carried statistics count as, those of several rollouts
 CLIP = 10.0
 
 

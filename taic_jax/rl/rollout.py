@@ -64,11 +64,11 @@ def start(
     With `stagger` their first episodes begin at random ticks, and have no return: else all would be in the same part of
     an episode for ever, if its end is the time limit's.
     """
-    key_ticks = jax.random.fold_in(key, num_envs)
     state: Any = jax.vmap(env.reset)(jax.random.split(key, num_envs))
     options = jax.vmap(executor.start)(jnp.zeros((num_envs, executor.option_size)), state.obs)
     total, never = jnp.zeros(num_envs), jnp.full(num_envs, jnp.nan, jnp.float32)
     if stagger:
+        key_ticks = jax.random.fold_in(key, num_envs)  # the resets of other tasks stay as they were
         state = state.replace(tick=jax.random.randint(key_ticks, (num_envs,), 0, env.episode_length))
         total = jnp.where(state.tick > 0, never, total)
     return RolloutCarry(state, options, jnp.zeros(num_envs, jnp.int32), jnp.ones(num_envs, bool), total, never)
