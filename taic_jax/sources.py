@@ -2,7 +2,7 @@
 
 import dataclasses
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import psutil
@@ -10,7 +10,16 @@ import psutil
 from taic_jax.artifacts.agents import Weights, load_policy, load_taic
 from taic_jax.artifacts.experience import gather_experience
 from taic_jax.artifacts.models import describe, load_options
-from taic_jax.config import COLLECT, Config, ConfigError, ReplayConfig, impossible, settings_of
+from taic_jax.config import (
+    COLLECT,
+    PRACTISE,
+    Config,
+    ConfigError,
+    DQNConfig,
+    ReplayConfig,
+    impossible,
+    settings_of,
+)
 from taic_jax.envs import environment_options, make_env
 from taic_jax.envs.base import Env
 from taic_jax.envs.errors import UnknownNameError
@@ -83,11 +92,12 @@ def check_memory(config: Config, env: Env, source: Env) -> None:
     total = psutil.virtual_memory().total
     for name, size in replay_sizes(config, env, source).items():
         if size > total:
-            group = config.collect if name == COLLECT else config.train
-            capacity = (group.sac if group.learner == "sac" else group.dqn).capacity
-            fits = int(min(capacity, group.ticks) * total / size / 2)
+            group = {COLLECT: config.collect, PRACTISE: config.practise}.get(name, config.train)
+            learner: Any = settings_of(group)
+            field = f"{name}.{'dqn' if isinstance(learner, DQNConfig) else 'sac'}.capacity"
+            fits = int(min(learner.capacity, group.ticks) * total / size / 2)
             expected = f"a buffer within the memory, {total / 2**30:.0f} GiB, for {config.seeds} seeds"
-            raise impossible(f"{name}.{group.learner}.capacity", capacity, expected, fits)
+            raise impossible(field, learner.capacity, expected, fits)
 
 
 class Inherited(NamedTuple):

@@ -47,7 +47,7 @@ def plan(config: Config, env: Env, source: Env) -> str:
     flat = settings_of(collect)
     rows = [("collect", source, flat, collect.ticks)] if collects else []
     if config.practise.ticks:
-        rows.append((PRACTISE, source, config.practise.ppo, config.practise.ticks))
+        rows.append((PRACTISE, source, config.practise.sac, config.practise.ticks))
     rows.append(("train", env, settings_of(train), train.ticks))
     for name in train.baselines:
         if not (name == "flat" and collector_is_baseline(config)):
@@ -75,17 +75,19 @@ def plan(config: Config, env: Env, source: Env) -> str:
 def replay_sizes(config: Config, env: Env, source: Env) -> dict[str, int]:
     """Return the bytes of the replay buffers of all seeds, by the stage that has one."""
     options = config.options
+    flat, chosen = (env.action_size, 1), (options.codes or options.size, options.length)
+    state_and_code = source.proprioceptive_size + options.size + 1
     stages = (
-        ("collect", config.collect, source, env.action_size, 1),
-        ("train", config.train, env, options.codes or options.size, options.length),
+        ("collect", settings_of(config.collect), config.collect.ticks, source, source.observation_size, *flat),
+        (PRACTISE, settings_of(config.practise), config.practise.ticks, source, state_and_code, *flat),
+        ("train", settings_of(config.train), config.train.ticks, env, env.observation_size, *chosen),
     )
     sizes = {}
-    for name, group, task, option_size, length in stages:
-        learner = settings_of(group)
-        if isinstance(learner, ReplayConfig):
+    for name, learner, ticks, task, observation_size, option_size, length in stages:
+        if ticks and isinstance(learner, ReplayConfig):
             goals = goals_of(learner, task)
-            row = row_size(task.observation_size, option_size, length, goals.size if goals else 0)
-            sizes[name] = 4 * row * min(learner.capacity, group.ticks) * config.seeds
+            row = row_size(observation_size, option_size, length, goals.size if goals else 0)
+            sizes[name] = 4 * row * min(learner.capacity, ticks) * config.seeds
     return sizes
 
 

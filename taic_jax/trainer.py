@@ -11,7 +11,7 @@ from jaxtyping import Array
 
 from taic_jax.analysis.evaluate import evaluate
 from taic_jax.artifacts.experience import as_experience
-from taic_jax.config import COLLECT, PRACTISE, Config, OptionsConfig, PPOConfig, ReplayConfig, replace, settings_of
+from taic_jax.config import COLLECT, PRACTISE, Config, OptionsConfig, ReplayConfig, replace, settings_of
 from taic_jax.envs.base import Env
 from taic_jax.networks import PolicyParams
 from taic_jax.options import learning
@@ -23,7 +23,9 @@ from taic_jax.rl import fine_tune, normalize, ppo, practise, refresh
 from taic_jax.rl.agent import Agent
 from taic_jax.rl.fine_tune import Tuned
 from taic_jax.rl.learner import Settings, learner_of, num_iterations
+from taic_jax.rl.off_policy import OffPolicyState
 from taic_jax.rl.practise import Practising
+from taic_jax.rl.refit import refit
 
 STEPS_PER_LOG = 100
 
@@ -106,21 +108,21 @@ class OptionTrainer(Trainer):
 
 
 class PractiseTrainer(Trainer):
-    """D of a model, by flat PPO on the task of going where codes say."""
+    """D of a model, by flat SAC on the task of going where codes say."""
 
     @property
-    def settings(self) -> PPOConfig:
-        """Settings of PPO, with D's layers."""
-        return practise.settings(self.config.practise, self.config.options)
+    def settings(self) -> Settings:
+        """Settings of SAC, with D's layers."""
+        return self._within(practise.settings(self.config.practise, self.config.options))
 
-    def init(self, key: Array) -> ppo.TrainState:
+    def init(self, key: Array) -> OffPolicyState:
         """Return the state whose actor is the learnt D."""
         assert self.model is not None
         state = super().init(key)
-        params = practise.actor_of(self.model.params["decoder"], state.params)
-        return state.replace(params=params, obs_statistics=normalize.identity(self.env.observation_size))
+        learnt = state.learnt.replace(policy=practise.actor_of(self.model.params["decoder"], state.learnt.policy))
+        return state.replace(learnt=learnt, obs_statistics=normalize.identity(self.env.observation_size))
 
-    def step(self, state: ppo.TrainState) -> tuple[ppo.TrainState, dict, None]:
+    def step(self, state: OffPolicyState) -> tuple[OffPolicyState, dict, None]:
         """Run one iteration; return the next state and metrics."""
         return *super().step(state)[:2], None
 
@@ -253,7 +255,7 @@ def refit_rows(env: Env, config: Config, models: OptionModel, keys: Array) -> tu
     """Refit E, P and F of practised models [K]."""
 
     def one(config: Config, model: OptionModel, key: Array) -> tuple[OptionModel, dict[str, Array]]:
-        return practise.refit(config.options, config.practise, env, model, key)
+        return refit(config.options, config.practise, env, model, key)
 
     return jax.vmap(one)(config, models, keys)
 

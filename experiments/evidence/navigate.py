@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Key
 
 from taic_jax.analysis.option_space import always
-from taic_jax.envs.ant_tasks import SUCCESS_RADIUS, upside_down
+from taic_jax.envs.ant_tasks import BODY_WIDTH, SUCCESS_RADIUS, upside_down
 from taic_jax.envs.arenas import SOLID_HEIGHT, Arena
 from taic_jax.envs.base import Env, State
 from taic_jax.envs.wrappers import AutoReset, Wrapper
@@ -26,6 +26,7 @@ CODES, STARTS, SECONDS = 128, 16, 6.0
 """Codes that the navigator chooses among, starts of each, and the time under one code."""
 WARM_UP = 1.0  # s under another code, so that starts differ
 EPISODES = 64
+ROUND = 1.5  # m, radius of the round about the goal
 RISK = 4.0  # m/s of speed that an overturned ant in every start is worth
 
 
@@ -81,6 +82,19 @@ def measure_codes(env: Env, executor: Executor, frame: Frame | None, key: Key[Ar
     return Compass(codes, mean[0], jnp.linalg.norm(mean[1], axis=-1), jnp.sum(over, axis=1) / count)
 
 
+def way_of(arena: Arena, place: Float[Array, "B 2"]) -> Float[Array, "B 2"]:
+    """Return the direction in which to go from these places; near the goal round it, since options do not stop."""
+    target, goal = next_place(arena, place), jnp.array(arena.goal[:2])[None]
+    low, high = jnp.array(arena.room).reshape(2, 1, 2)
+    centre = jnp.clip(goal, low + ROUND + BODY_WIDTH, high - ROUND - BODY_WIDTH)
+    last = jnp.all(target == goal, axis=1, keepdims=True)
+    way = jnp.where(last, centre, target) - place
+    distance = jnp.maximum(jnp.linalg.norm(way, axis=1, keepdims=True), 1e-6)
+    inward = jnp.where(last, jnp.clip(distance / ROUND - 1.0, -1.0, 1.0), 1.0)
+    side = jnp.stack([-way[:, 1], way[:, 0]], axis=1)
+    return (inward * way + jnp.sqrt(1.0 - inward**2) * side) / distance
+
+
 def next_place(arena: Arena, place: Float[Array, "B 2"]) -> Float[Array, "B 2"]:
     """Return where to go next from these places; outside all rectangles to the goal."""
     boxes, places = (np.array(x, np.float32) for x in zip(*arena.ways, strict=True))
@@ -97,9 +111,7 @@ def navigate(env: Any, executor: Executor, compass: Compass, frame: Frame | None
 
     def decide(obs: Array, noise: Array) -> tuple[Array, Array]:
         place = obs[:, size : size + 2]
-        way = next_place(env.arena, place) - place
-        way = turning.turned(way, obs[:, :size])
-        way = way / jnp.maximum(jnp.linalg.norm(way, axis=-1, keepdims=True), 1e-6)
+        way = turning.turned(way_of(env.arena, place), obs[:, :size])
         score = way @ compass.velocity.T - RISK * compass.overturned[None]
         return compass.codes[jnp.argmax(score, axis=1)], jnp.zeros(len(obs))
 

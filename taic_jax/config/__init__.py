@@ -22,7 +22,7 @@ from taic_jax.config.base import (
     Track,
     impossible,
 )
-from taic_jax.config.learners import DQNConfig, FineTuneConfig, PPOConfig, ReplayConfig, SACConfig
+from taic_jax.config.learners import DQNConfig, FineTuneConfig, PPOConfig, PractiseConfig, ReplayConfig, SACConfig
 
 __all__ = [
     "COLLECT", "CONFIG_CLASSES", "METHOD_LABELS", "PRACTISE", "TAIC", "TINY", "USUAL_BOUNDS", "Bounds",
@@ -95,6 +95,8 @@ class OptionsConfig:
     """D in open loop, an LSTM that never looks at the state (the paper's), or in closed loop, pi(a|o,s)."""
     decoder_sizes: tuple[int, ...] = (128, 128)
     """Widths of the hidden layers of a closed-loop D."""
+    squash: bool = False
+    """Bound the actions of a closed-loop D by tanh, as SAC does; practice needs it."""
     termination: Literal["fixed", "output", "predict"] = "fixed"
     """End of an option: after length ticks, at D's end signal, or when P is surprised (section 3.4)."""
     shortest: int = 1
@@ -158,31 +160,6 @@ class OptionsConfig:
     """Gradient steps of a refresh."""
     refresh_weight: float = 1.0
     """Weight of the mean squared change that a refresh makes to D's actions, for the codes in use."""
-
-
-@dataclass(frozen=True)
-class PractiseConfig:
-    """Stage practise: D of a body with a heading learns on-policy to go where codes say; off unless it has ticks."""
-
-    ticks: Natural = 0
-    """Budget of interactions per seed; 0 leaves D as learnt."""
-    hold: int = 3
-    """Most options for which a code from the prior is held."""
-    reward: Literal["direction", "information"] = "direction"
-    """Reward: the speed in a code's direction; or the mutual information of code and way (eq. 8)."""
-    speed: Positive = 1.5
-    """Speed in m/s in a code's direction beyond which more earns nothing: fast ants fall."""
-    control_cost: float = 0.1
-    """Weight of |action|^2 in the reward."""
-    kl_weight: float = 0.0
-    """Weight of half the squared change of D's actions since it was learnt: a KL divergence under noise of 1."""
-    upright: float = 1.0
-    """Weight of the upward part of the torso's own axis in the reward."""
-    refit_steps: int = 1000
-    """Gradient steps at the end that refit E, P and F to D."""
-    ppo: PPOConfig = PPOConfig(
-        rollout_length=256, minibatch_size=256, log_std_init=-1.9, normalize_reward=True, hidden_sizes=(128, 128)
-    )
 
 
 @dataclass(frozen=True)
@@ -254,8 +231,10 @@ def method_label(method: str, learner: str) -> str:
     return METHOD_LABELS.get(method, method).replace("PPO", learner.upper())
 
 
-def settings_of(group: CollectConfig | TrainConfig) -> PPOConfig | SACConfig | DQNConfig:
+def settings_of(group: CollectConfig | PractiseConfig | TrainConfig) -> PPOConfig | SACConfig | DQNConfig:
     """Return the settings of the group's learner."""
+    if isinstance(group, PractiseConfig):
+        return group.sac
     return {"ppo": group.ppo, "sac": group.sac, "dqn": group.dqn}[group.learner]
 
 

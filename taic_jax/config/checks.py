@@ -6,7 +6,7 @@ from typing import Annotated, Any, get_args, get_origin
 
 from taic_jax.config import USUAL_BOUNDS, Config, field_types, impossible, walk
 
-REPLAYS = ("collect.sac", "collect.dqn", "train.sac", "train.dqn")
+REPLAYS = ("collect.sac", "collect.dqn", "practise.sac", "train.sac", "train.dqn")
 
 
 def validate(config: Config) -> None:
@@ -55,6 +55,7 @@ def _check_steering(config: Config) -> None:
     practises = config.practise.ticks > 0
     for applies, name, value, needed, why in (
         (practises, "decoder", options.decoder, "closed", "since an open-loop D cannot react"),
+        (practises, "squash", options.squash, True, "since D is the actor of SAC"),
         (True, "frame", options.frame, "heading", "from which a code's direction is seen"),
         (True, "way_weight", options.way_weight or None, options.way_weight or 16, "so that P tells the ways of codes"),
     ):
@@ -78,16 +79,18 @@ def _check_learners(config: Config) -> None:
     ):
         if applies and learner != "ppo":
             raise impossible(name, learner, needed, "ppo")
-    for stage, group in (("collect", config.collect), ("train", train)):
-        for name, learner in ((f"{stage}.sac", group.sac), (f"{stage}.dqn", group.dqn)):
-            if learner.capacity < (fewest := learner.num_envs * learner.update_every):
-                expected = f"the decisions of a round, {name}.num_envs * {name}.update_every = {fewest}"
-                raise impossible(f"{name}.capacity", learner.capacity, expected, fewest)
-            if learner.rollout_length % learner.update_every:
-                rounds = range(1, learner.update_every + 1)
-                valid = max(n for n in rounds if learner.rollout_length % n == 0)
-                expected = f"a divisor of {name}.rollout_length = {learner.rollout_length}"
-                raise impossible(f"{name}.update_every", learner.update_every, expected, valid)
+    if config.practise.sac.relabel:
+        raise impossible("practise.sac.relabel", config.practise.sac.relabel, "0, since a code is no goal", 0)
+    values = dict(walk(config))
+    for name in REPLAYS:
+        fields = ("num_envs", "update_every", "rollout_length", "capacity")
+        num_envs, every, length, capacity = (values[f"{name}.{field}"] for field in fields)
+        if capacity < (fewest := num_envs * every):
+            expected = f"the decisions of a round, {name}.num_envs * {name}.update_every = {fewest}"
+            raise impossible(f"{name}.capacity", capacity, expected, fewest)
+        if length % every:
+            valid = max(n for n in range(1, every + 1) if length % n == 0)
+            raise impossible(f"{name}.update_every", every, f"a divisor of {name}.rollout_length = {length}", valid)
 
 
 def _check_bounds(name: str, kind: Any, value: Any) -> None:
@@ -105,7 +108,7 @@ def _check_limits(config: Config) -> None:
     """Check the fields whose bounds are other fields, or products of them."""
     values, baselines = dict(walk(config)), config.train.baselines
     flat, over_options = f"collect.{config.collect.learner}", f"train.{config.train.learner}"
-    flats = (flat, over_options, "practise.ppo")
+    flats = (flat, over_options, "practise.sac")
     collected, trained, practised = (f"{x}.num_envs * {x}.rollout_length" for x in flats)
     by_ppo, refreshes = over_options == "train.ppo", config.options.refresh_every
     for applies, name, allowed, expected, other in (
@@ -116,7 +119,6 @@ def _check_limits(config: Config) -> None:
         (config.train.fine_tune.epochs, "train.fine_tune.minibatch_size", le, "at most", trained),
         (True, "train.ticks", ge, "at least one iteration,", trained),
         (config.practise.ticks, "practise.ticks", ge, "at least one iteration,", practised),
-        (config.practise.ticks, "practise.ppo.minibatch_size", le, "at most", practised),
         (refreshes, "train.ticks", ge, "at least one refresh,", f"{trained} * options.refresh_every"),
         (by_ppo, "options.length", le, "at most", "train.ppo.rollout_length"),
         (True, "options.shortest", le, "at most", "options.length"),

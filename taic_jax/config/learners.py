@@ -1,8 +1,8 @@
-"""The configuration of the learners: of a policy over options or actions, and of D's fine-tuning."""
+"""The configuration of the learners: of a policy over options or actions, and of D's practice and fine-tuning."""
 
 import math
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Literal
 
 from taic_jax.config.base import Bounds, LogStd, Natural, Positive, Share
 
@@ -80,6 +80,8 @@ class ReplayConfig:
     """Most decisions between a transition and the later one whose achievement becomes its goal."""
     learning_rate: float = 3e-4
     """Step size of Adam."""
+    learning_rate_decay: bool = False
+    """Let the step size fall linearly to zero over the stage."""
     gamma: Share = 0.99
     """Discount per tick."""
     reward_scale: Positive = 1.0
@@ -126,3 +128,35 @@ class FineTuneConfig:
     """Standard deviation of the noise on D's actions while training."""
     kl_weight: float = 0.0
     """Weight of the KL divergence from the learnt D."""
+
+
+@dataclass(frozen=True)
+class PractiseConfig:
+    """Stage practise: D of a body with a heading learns by acting to go where codes say; off unless it has ticks."""
+
+    ticks: Natural = 0
+    """Budget of interactions per seed; 0 leaves D as learnt."""
+    hold: int = 6
+    """Most options for which a code from the prior is held."""
+    reward: Literal["direction", "information"] = "direction"
+    """Reward: the speed in a code's direction; or the mutual information of code and way (eq. 8)."""
+    speed: Positive = 2.0
+    """Speed in m/s in a code's direction beyond which more earns nothing: fast ants fall."""
+    control_cost: float = 0.1
+    """Weight of |action|^2 in the reward."""
+    kl_weight: float = 0.0
+    """Weight of half the squared change of D's actions since it was learnt: a KL divergence under noise of 1."""
+    upright: float = 1.0
+    """Weight of the upward part of the torso's own axis in the reward."""
+    refit_steps: int = 1000
+    """Gradient steps at the end that refit E, P and F to D."""
+    # Hidden layers are those of D.
+    sac: SACConfig = SACConfig(
+        warmup=0,
+        update_every=8,
+        updates_per_decision=0.5,
+        batch_size=64,
+        learning_rate=1e-3,
+        learning_rate_decay=True,
+        temperature=0.1,
+    )

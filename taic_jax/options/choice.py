@@ -1,5 +1,6 @@
 """The choice of an option by its consequence: the way that it shall lead (eq. 8)."""
 
+from functools import partial
 from typing import Any
 
 import jax
@@ -26,10 +27,15 @@ def leading(
 ) -> tuple[Float[Array, " D"], Int[Array, ""]]:
     """Return the code and the view of the body that lead farthest along a way in the world's axes.
 
-    P predicts the ways of codes from the mean state, seen from the heading; the length of `way` does not matter.
+    P predicts the ways of codes from this state in every view; the length of `way` does not matter.
     """
     frame: Any = model.networks.frame
     codes = jnp.asarray(menu(model.networks.encoder.option_size))
-    gain = model.views.directions(frame.turned(way, state)) @ jax.vmap(model.way)(codes).T
+
+    def gains(view: Int[Array, ""], direction: Float[Array, " 2"]) -> Float[Array, " 64"]:
+        seen = model.views.obs(view, state)
+        return jax.vmap(partial(model.way, model.see(seen, seen)))(codes) @ direction
+
+    gain = jax.vmap(gains)(jnp.arange(len(model.views)), model.views.directions(frame.turned(way, state)))
     view = jnp.argmax(jnp.max(gain, axis=1)).astype(jnp.int32)
     return codes[jnp.argmax(gain[view])], view

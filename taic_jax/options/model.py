@@ -103,6 +103,7 @@ class ClosedDecoder(nn.Module):
     action_size: int
     hidden_sizes: Sequence[int]
     length: int
+    squash: bool = False
 
     def setup(self) -> None:
         self.mlp = MLP((*self.hidden_sizes, self.action_size + 1))
@@ -116,7 +117,7 @@ class ClosedDecoder(nn.Module):
     ) -> tuple[Array, tuple[Array, Array]]:
         """Return the next carry, the action [A] and the logit that it is the last one []."""
         output = self.mlp(jnp.concatenate([state, option, carry[None]]))
-        return carry + 1.0 / self.length, (output[:-1], output[-1])
+        return carry + 1.0 / self.length, (self._actions(output), output[-1])
 
     def __call__(
         self, option: Float[Array, " D"], states: Float[Array, "L P"]
@@ -124,13 +125,16 @@ class ClosedDecoder(nn.Module):
         """Return the actions and end logits that L steps through these states give."""
         ticks = jnp.arange(len(states), dtype=jnp.float32)[:, None] / self.length
         outputs = self.mlp(jnp.hstack([states, jnp.broadcast_to(option, (len(states), *option.shape)), ticks]))
-        return outputs[:, :-1], outputs[:, -1]
+        return self._actions(outputs), outputs[:, -1]
 
     def at(
         self, option: Float[Array, " D"], state: Float[Array, " P"], tick: Int[Array, ""], length: int
     ) -> Float[Array, " A"]:
         """Return the `tick`-th action of `length`, counted from 0, in this state."""
         return self.step(tick.astype(jnp.float32) / length, option, state)[1][0]
+
+    def _actions(self, outputs: Float[Array, "*batch O"]) -> Float[Array, "*batch A"]:
+        return jnp.tanh(outputs[..., :-1]) if self.squash else outputs[..., :-1]
 
 
 class Predictor(nn.Module):
@@ -200,6 +204,11 @@ class OptionModel(struct.PyTreeNode):
         """P."""
         return self.state_scale.mean.shape[-1]
 
+    @property
+    def sides(self) -> int:
+        """Equal sides of the body, each a view in which an option can begin; 1 without options by their way."""
+        return len(self.views) if self.views else 1
+
     def see(self, states: Float[Array, "*batch P"], first: Float[Array, "*#batch P"]) -> Float[Array, "*batch P"]:
         """Return normalised states, in the frame of the heading as seen from `first`, clipped there."""
         if not (frame := self.networks.frame):
@@ -231,9 +240,9 @@ class OptionModel(struct.PyTreeNode):
         """Return the normalised change of a normalised state under an option."""
         return apply(self.networks.predictor, self.params["predictor"], state, option)
 
-    def way(self, option: Float[Array, " D"]) -> Float[Array, " 2"]:
-        """Return the way in m that P predicts of an option from the mean state, with a frame that has the way."""
-        predicted = self.predict(jnp.zeros(self.state_size), option)
+    def way(self, state: Float[Array, " P"], option: Float[Array, " D"]) -> Float[Array, " 2"]:
+        """Return the way in m that P predicts of an option from a normalised state, with a frame that has the way."""
+        predicted = self.predict(state, option)
         return (predicted * self.change_scale.std + self.change_scale.mean)[-2:]
 
     def estimate(self, option: Float[Array, " D"]) -> Float[Array, "2 P"]:
@@ -251,7 +260,7 @@ def make_networks(
     """Return the modules for states [P] and actions [A], which are one-hot if `discrete`, of a body with a heading."""
     frame = make_frame(config, heading)
     if config.decoder == "closed":
-        decoder = ClosedDecoder(action_size, tuple(config.decoder_sizes), config.length)
+        decoder = ClosedDecoder(action_size, tuple(config.decoder_sizes), config.length, config.squash)
     else:
         decoder = OpenDecoder(action_size, config.hidden_size)
     return Networks(

@@ -4,6 +4,7 @@ A learner is a `Rule`, which sees transitions of normalised observations. Flat c
 identity executor.
 """
 
+import dataclasses
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
@@ -104,8 +105,11 @@ def iterate(
 ) -> tuple[OffPolicyState, dict[str, Array], Rollout]:
     """Run one iteration: several rounds of ticks in B environments, each followed by its gradient steps.
 
-    Returns the next state, the iteration's metrics and the rollout. The number of iterations has no effect.
+    Returns the next state, the iteration's metrics and the rollout. Of all `num_iterations` the step size may decay.
     """
+    if config.learning_rate_decay:
+        left = 1.0 - state.iteration / num_iterations
+        config = dataclasses.replace(config, learning_rate=left * config.learning_rate)
     key, key_rounds = jax.random.split(state.key)
     rounds = config.rollout_length // config.update_every
     step = partial(_round, rule, config, env, executor)

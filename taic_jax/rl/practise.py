@@ -1,7 +1,7 @@
-"""Practice: D is refined on-policy on open ground, so that a code leads where it says from every start.
+"""Practice: D is refined by acting on open ground, so that a code leads where it says from every start.
 
-Codes from the prior are held for one or more options each. D acts through its own mean, and is learnt by flat PPO,
-whose actor it is: its input is the observation of the task `Practising`. A code says where it leads by P, as learnt
+Codes from the prior are held for one or more options each. D is the mean of the actor of flat SAC: its input is the
+observation of the task `Practising`. A code says where it leads by P, as learnt
 before: the way that P predicts from the mean state.
 """
 
@@ -14,21 +14,14 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float, Key
 
-from taic_jax.config import OptionsConfig, PPOConfig, PractiseConfig
+from taic_jax.config import OptionsConfig, PractiseConfig, SACConfig
 from taic_jax.envs.base import Env, State
 from taic_jax.envs.wrappers import AutoReset, Wrapper
-from taic_jax.networks import PolicyParams, apply
-from taic_jax.options.dataset import Window, gather
-from taic_jax.options.execution import make_executor
-from taic_jax.options.learning import descend
-from taic_jax.options.losses import adversarial_loss, prediction_loss
+from taic_jax.networks import SquashedParams, apply
 from taic_jax.options.model import OptionModel
-from taic_jax.rl import refresh
-from taic_jax.rl.rollout import rollout, start
 
+STD = 0.3  # of the actor's noise before it is squashed, at the start of practice
 METRICS = ("speed_along", "speed_across", "upright")
-REFIT_ENVS, REFIT_OPTIONS = 64, 40
-"""Environments, and options in each, from which E and P are refitted."""
 SECTOR_CODES, OTHERS = 256, 32  # codes that measure the sector, and that one code is compared with
 
 
@@ -110,7 +103,7 @@ class Practising(Wrapper):
         left, tick = jax.random.randint(key_left, (), 1, self.config.hold + 1), jnp.zeros((), jnp.int32)
         practice = practice.replace(
             code=code, direction=direction(self.model, practice.sector, code), left=left, tick=tick, key=key,
-            view=jax.random.randint(key_view, (), 0, _sides(self.model)), way=jnp.zeros(2),
+            view=jax.random.randint(key_view, (), 0, self.model.sides), way=jnp.zeros(2),
         )  # fmt: skip
         first = self._state(practice, practice.inner.obs)
         return practice.replace(first=first, obs=self._observe(practice, practice.inner.obs))
@@ -172,7 +165,7 @@ class Sector(NamedTuple):
 def sector_of(model: OptionModel) -> Sector:
     """Measure the sector over codes of the prior."""
     codes = jax.random.normal(jax.random.key(0), (SECTOR_CODES, model.networks.encoder.option_size))
-    ways = jax.vmap(model.way)(codes)
+    ways = jax.vmap(partial(model.way, jnp.zeros(model.state_size)))(codes)
     middle = jnp.arctan2(*jnp.mean(ways, axis=0)[::-1])
     return Sector(middle, jnp.std(jax.vmap(partial(angle_from, middle))(ways)))
 
@@ -189,81 +182,35 @@ def direction(model: OptionModel, sector: Sector, code: Float[Array, " D"]) -> F
     Codes keep their order by P, and spread evenly over the part of the circle that one view has to cover: P, a mean,
     predicts ways that differ less than they do, and an ant that turns to where it goes sees them all ahead.
     """
-    share = jax.scipy.stats.norm.cdf(angle_from(sector.middle, model.way(code)) / sector.spread)
-    angle = sector.middle + jnp.pi / _sides(model) * (2.0 * share - 1.0)
+    way = model.way(jnp.zeros(model.state_size), code)
+    share = jax.scipy.stats.norm.cdf(angle_from(sector.middle, way) / sector.spread)
+    angle = sector.middle + jnp.pi / model.sides * (2.0 * share - 1.0)
     return jnp.stack([jnp.cos(angle), jnp.sin(angle)])
 
 
-def _sides(model: OptionModel) -> int:
-    return len(model.views) if model.views else 1
+def settings(config: PractiseConfig, options: OptionsConfig) -> SACConfig:
+    """Return the settings of SAC, whose actor has the hidden layers of D."""
+    return dataclasses.replace(config.sac, hidden_sizes=options.decoder_sizes)
 
 
-def settings(config: PractiseConfig, options: OptionsConfig) -> PPOConfig:
-    """Return the settings of PPO, whose actor has the hidden layers of D."""
-    return dataclasses.replace(config.ppo, hidden_sizes=options.decoder_sizes)
-
-
-def actor_of(decoder: Any, fresh: PolicyParams) -> PolicyParams:
-    """Return fresh parameters of PPO whose actor is a closed-loop D without its end logit."""
-    layers = dict(decoder["params"]["mlp"])
-    last = f"Dense_{len(layers) - 1}"
-    layers[last] = jax.tree.map(lambda x: x[..., :-1], layers[last])
+def actor_of(decoder: Any, fresh: SquashedParams) -> SquashedParams:
+    """Return an actor whose mean is a squashed D, and whose deviation is `STD` everywhere."""
+    layers, last = _layers(decoder["params"]["mlp"])
+    means = jax.tree.map(lambda x: x[..., :-1], layers[last])
+    stds = {"kernel": jnp.zeros_like(means["kernel"]), "bias": jnp.full_like(means["bias"], jnp.log(STD))}
+    layers[last] = jax.tree.map(lambda *x: jnp.concatenate(x, axis=-1), means, stds)
     return fresh.replace(actor={"params": layers})
 
 
 def decoder_of(actor: Any, decoder: Any) -> Any:
-    """Return D with the layers of an actor, and its own end logit."""
-    layers = dict(actor["params"])
-    last, own = f"Dense_{len(layers) - 1}", decoder["params"]["mlp"]
-    joined = jax.tree.map(lambda new, old: jnp.concatenate([new, old[..., -1:]], axis=-1), layers[last], own[last])
-    return {"params": {"mlp": layers | {last: joined}}}
+    """Return D with the layers of an actor's mean, and its own end logit."""
+    layers, last = _layers(actor["params"])
+    means = jax.tree.map(lambda x: jnp.split(x, 2, axis=-1)[0], layers[last])
+    own = decoder["params"]["mlp"][last]
+    layers[last] = jax.tree.map(lambda mean, old: jnp.concatenate([mean, old[..., -1:]], axis=-1), means, own)
+    return {"params": {"mlp": layers}}
 
 
-def refit(
-    options: OptionsConfig, config: PractiseConfig, env: Env, model: OptionModel, key: Key[Array, ""]
-) -> tuple[OptionModel, dict[str, Array]]:
-    """Learn E, P and F further from what codes of the prior do now, drawn anew for every option; D stays.
-
-    E learns the likelihood of the code of its actions, since it shall still tell which option an action sequence is.
-    Returns the model and the losses of every step.
-    """
-    key_start, key_run, key_steps = jax.random.split(key, 3)
-    env, executor = (
-        AutoReset(env),
-        make_executor(dataclasses.replace(options, termination="fixed", choose="code"), model),
-    )
-    begin = start(env, executor, REFIT_ENVS, key_start)
-    ticks = REFIT_OPTIONS * options.length
-    _, run = rollout(env, executor, lambda obs, noise: (noise, jnp.zeros(len(obs))), begin, key_run, ticks)
-    own = refresh.own_options(run, model)
-
-    def step(state: Any, key: Array) -> tuple[Any, dict[str, Array]]:
-        which = jax.random.randint(key, (options.batch_size,), 0, own.windows.count)
-        windows = gather(own.windows, which, own.duration[which], options.length)
-        return descend(refit_loss, options, model, state, windows, own.code[which])
-
-    learnt, losses = jax.lax.scan(
-        step, refresh.init(options, model, key), jax.random.split(key_steps, config.refit_steps)
-    )
-    return model.replace(params=learnt.params), losses
-
-
-def refit_loss(
-    params: dict, model: OptionModel, options: OptionsConfig, windows: Window, codes: Float[Array, "N D"]
-) -> tuple[Float[Array, ""], dict[str, Array]]:
-    """Return the mean loss of E, P and F over N whole windows of these codes, and its terms."""
-    model = model.replace(params=params)
-
-    def one(window: Window, code: Float[Array, " D"]) -> dict[str, Array]:
-        means, log_stds = model.encode(window.actions)
-        z = (code - means[-1]) / jnp.exp(log_stds[-1])
-        states = model.see(window.states, window.states[:1])
-        change = model.changes(window.states)[-1]
-        return {
-            "encoder_loss": jnp.mean(0.5 * jnp.square(z) + log_stds[-1]),
-            "prediction_loss": prediction_loss(model.predict(states[0], code), change),
-            "adversarial_loss": adversarial_loss(model.estimate(code), states[0], states[-1]),
-        }
-
-    terms = jax.tree.map(jnp.mean, jax.vmap(one)(windows, codes))
-    return sum(terms.values(), jnp.zeros(())), terms
+def _layers(params: Any) -> tuple[dict, str]:
+    """Return a copy of the layers of an MLP, and the name of the last."""
+    return dict(params), f"Dense_{len(params) - 1}"

@@ -124,14 +124,21 @@ def test_reference_levels(arena, stand, walk):
 
 
 @pytest.mark.parametrize("arena", [MAZE, PUSH, FALL])
-def test_ways_lead_from_the_start_to_the_goal(arena):
-    place, seen = jnp.zeros((1, 2)), []
+def test_ways_lead_from_the_start_to_the_goal_and_round_it(arena):
+    """Options do not stop: at the goal they go on without a sharp turn, clear of the walls."""
+    place, seen, places, ways = jnp.zeros((1, 2)), [], [], []
     for _ in range(400):
-        to = navigate.next_place(arena, place)
-        seen.append(tuple(np.asarray(to[0]).tolist()))
-        place = place + 0.25 * (to - place) / jnp.maximum(jnp.linalg.norm(to - place), 0.25)
+        seen.append(tuple(np.asarray(navigate.next_place(arena, place)[0]).tolist()))
+        ways.append(navigate.way_of(arena, place)[0])
+        np.testing.assert_allclose(np.linalg.norm(ways[-1]), 1.0, atol=1e-5)
+        place = place + 0.25 * ways[-1][None]
+        places.append(place[0])
     assert list(dict.fromkeys(seen)) == [to for _, to in arena.ways]
-    assert float(jnp.linalg.norm(place[0] - jnp.array(arena.goal[:2]))) < 0.5
+    rounds, turns = np.array(places[-100:]), np.sum(np.array(ways[-100:-1]) * np.array(ways[-99:]), axis=1)
+    assert np.linalg.norm(rounds - np.array(arena.goal[:2]), axis=1).max() < 4.0
+    assert turns.min() > np.cos(np.radians(20)) and np.ptp(rounds, axis=0).min() > 2.0
+    low, high = np.array(arena.room).reshape(2, 2)
+    assert (rounds > low + 1.0).all() and (rounds < high - 1.0).all()
 
 
 def test_the_picture_has_all_panels(tmp_path):

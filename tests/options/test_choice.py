@@ -55,7 +55,7 @@ def test_views_turn_directions_as_they_turn_velocities(env):
 @pytest.mark.parametrize("yaw", [0.0, 2.5])
 def test_a_way_chooses_the_side_and_the_code_that_lead_along_it(env, executor, monkeypatch, yaw):
     """By a P that says that a code leads to the left of ahead by its first entry in rad."""
-    monkeypatch.setattr(OptionModel, "way", lambda _, code: jnp.stack([jnp.cos(code[0]), jnp.sin(code[0])]))
+    monkeypatch.setattr(OptionModel, "way", lambda _, state, code: jnp.stack([jnp.cos(code[0]), jnp.sin(code[0])]))
     assert executor.option_size == 2
     for angle in np.radians([-170, -100, -40, -10, 0, 30, 60, 120]):
         way = 3.0 * jnp.array([np.cos(angle + yaw), np.sin(angle + yaw)])
@@ -66,7 +66,7 @@ def test_a_way_chooses_the_side_and_the_code_that_lead_along_it(env, executor, m
 
 
 def test_among_codes_that_lead_the_same_way_the_farthest_is_chosen(env, executor, monkeypatch):
-    monkeypatch.setattr(OptionModel, "way", lambda _, code: jnp.stack([2.0 + code[1], 0.0 * code[1]]))
+    monkeypatch.setattr(OptionModel, "way", lambda _, state, code: jnp.stack([2.0 + code[1], 0.0 * code[1]]))
     running = executor.start(jnp.array([1.0, 0.0]), facing(env, 0.0))
     codes = menu(2)
     np.testing.assert_allclose(running.option, codes[np.argmax(codes[:, 1])], rtol=1e-6)
@@ -80,10 +80,27 @@ def test_the_menu_is_the_middle_of_the_prior():
     np.testing.assert_allclose(codes.mean(axis=0), 0.0, atol=0.3)
 
 
-def test_the_way_of_a_code_is_ps_prediction_from_the_mean_state(env, executor):
-    model, code = executor.model, jnp.array([0.3, -0.9])
-    predicted = model.predict(jnp.zeros(27), code) * model.change_scale.std + model.change_scale.mean
-    np.testing.assert_array_equal(model.way(code), predicted[27:])
+def test_the_way_of_a_code_is_ps_prediction(executor):
+    model, state, code = executor.model, draw(np.random.default_rng(1), 27), jnp.array([0.3, -0.9])
+    predicted = model.predict(state, code) * model.change_scale.std + model.change_scale.mean
+    np.testing.assert_array_equal(model.way(state, code), predicted[27:])
+
+
+@pytest.mark.parametrize("angle", [0.0, np.pi / 2, np.pi, -np.pi / 2])
+def test_p_sees_the_state_in_every_view(env, executor, monkeypatch, angle):
+    """By a P that says that an ant goes on ahead if it does so now, and otherwise nowhere."""
+    at = env.heading.velocity
+    scale = executor.model.state_scale
+
+    def way(_, state, code):
+        ahead = (state * scale.std + scale.mean)[at]
+        return jnp.stack([jnp.where(ahead > 0.1, ahead, 0.0), jnp.zeros(())])
+
+    monkeypatch.setattr(OptionModel, "way", way)
+    moving = jnp.array([np.cos(angle), np.sin(angle)], jnp.float32)
+    state = facing(env, 0.0).at[at : at + 2].set(moving)
+    running = executor.start(moving, state)
+    assert int(running.view) == round(-angle / (np.pi / 2)) % 4
 
 
 def test_an_option_does_in_its_view_what_it_does_ahead(env, executor):

@@ -64,6 +64,17 @@ def test_a_closed_loop_can_tell_time():
         assert np.abs(np.diff(output, axis=0)).min() > 1e-3
 
 
+def test_a_squashed_d_bounds_its_actions_and_not_its_end_signal():
+    plain, squashed = (
+        random_model(dataclasses.replace(CLOSED, squash=squash), STATE_SIZE, ACTION_SIZE) for squash in (False, True)
+    )
+    option, states = jnp.array([2.0, -4.0]), draw(np.random.default_rng(5), 3, STATE_SIZE)
+    (actions, ends), (bounded, same) = plain.decode(option, states), squashed.decode(option, states)
+    np.testing.assert_allclose(bounded, np.tanh(actions), rtol=1e-5)
+    np.testing.assert_array_equal(ends, same)
+    assert np.abs(actions).max() > 1.0
+
+
 def test_the_executor_shows_a_closed_loop_the_normalised_state():
     model = random_model(CLOSED, STATE_SIZE, ACTION_SIZE)
     executor, option = make_executor(CLOSED, model), jnp.array([0.5, -1.0])

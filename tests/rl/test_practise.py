@@ -1,4 +1,4 @@
-"""Practice: its task by hand, D as PPO's actor, and a sled that learns to go where codes say."""
+"""Practice: its task by hand, D as SAC's actor, and a sled that learns to go where codes say."""
 
 import dataclasses
 from functools import partial
@@ -13,7 +13,6 @@ from scipy import special, stats
 from sled import Sled
 from tiny_runs import (
     CONFIG,
-    PPO,
     KilledError,
     assert_same_arrays,
     die,
@@ -26,15 +25,16 @@ from tiny_runs import (
 
 import taic_jax as taic
 from taic_jax.artifacts.models import load_options
-from taic_jax.config import Config, ConfigError, OptionsConfig, PPOConfig, PractiseConfig
+from taic_jax.config import Config, ConfigError, OptionsConfig, PractiseConfig, SACConfig
 from taic_jax.config.checks import validate
 from taic_jax.envs import AutoReset, TimeLimit
 from taic_jax.envs.views import one_view
 from taic_jax.options.execution import IdentityExecutor, make_executor
 from taic_jax.report.curves import pretraining
 from taic_jax.report.runs import read_run
-from taic_jax.rl import ppo, practise
+from taic_jax.rl import practise, sac
 from taic_jax.rl.practise import Practising
+from taic_jax.rl.refit import refit
 from taic_jax.rl.rollout import rollout, start
 from taic_jax.runtime.checkpoint import Checkpoints
 from taic_jax.summary import plan
@@ -44,11 +44,12 @@ from taic_jax.types import as_arrays
 L, HOLD = 4, 3
 OPTIONS = as_arrays(OptionsConfig(
     length=L, size=2, hidden_size=8, mlp_sizes=(16,), decoder_sizes=(16,), batch_size=64, decoder="closed",
-    frame="heading", way_weight=2, learning_rate=3e-3,
+    squash=True, frame="heading", way_weight=2, learning_rate=3e-3,
 ))  # fmt: skip
 PRACTICE = PractiseConfig(
     ticks=30_000, hold=HOLD, speed=0.8, refit_steps=300,
-    ppo=PPOConfig(num_envs=16, rollout_length=32, minibatch_size=128, log_std_init=-0.5, learning_rate=1e-2),
+    sac=SACConfig(rollout_length=32, update_every=8, updates_per_decision=0.25, batch_size=64, warmup=0,
+                  temperature=0.1, learning_rate=1e-3),
 )  # fmt: skip
 
 
@@ -88,13 +89,13 @@ def walked(task):
 
 
 def fresh(task):
-    """Return fresh parameters of PPO on the task."""
-    policy = ppo.make_policy(IdentityExecutor(2), practise.settings(PRACTICE, OPTIONS))
-    return policy, policy.init(jax.random.key(0), task.observation_size, -1.0)
+    """Return fresh parameters of SAC on the task."""
+    policy = sac.make_policy(IdentityExecutor(2), practise.settings(PRACTICE, OPTIONS))
+    return policy, policy.init(jax.random.key(0), task.observation_size, 1.0)
 
 
 def test_the_observation_is_the_input_of_d(task, model, walk):
-    """PPO's actor does in the task what the executor does with the code."""
+    """SAC's mean actor does in the task what the executor does with the code."""
     policy, params = fresh(task)
     params, executor = practise.actor_of(model.params["decoder"], params), make_executor(OPTIONS, model)
     practice = walk[2].physics
@@ -103,7 +104,7 @@ def test_the_observation_is_the_input_of_d(task, model, walk):
         carry = executor.start(practice.code[t, b], state)
         for _ in range(int(practice.tick[t, b]) + 1):
             carry, action = executor.act(carry, state, jnp.zeros(0))
-        np.testing.assert_allclose(np.clip(policy.mode(params, practice.obs[t, b]), -1, 1), action, atol=1e-5)
+        np.testing.assert_allclose(policy.mode(params, practice.obs[t, b]), action, atol=1e-5)
         np.testing.assert_array_equal(practice.obs[t, b], walk[2].obs[t, b])
 
 
@@ -113,6 +114,9 @@ def test_d_becomes_the_actor_and_the_actor_d(task, model):
     assert_trees_equal(practise.decoder_of(params.actor, decoder), decoder)
     other = jax.tree.map(lambda x: x + 1.0, params.actor)
     changed = practise.decoder_of(other, decoder)["params"]["mlp"]["Dense_1"]
+    noise = jax.random.normal(jax.random.key(2), (500, 2))
+    options, _ = fresh(task)[0].draw(params, jnp.zeros((500, task.observation_size)), 1.0, noise)
+    assert np.arctanh(options).std(axis=0) == pytest.approx([practise.STD] * 2, rel=0.1)
     np.testing.assert_array_equal(changed["kernel"][:, :2], decoder["params"]["mlp"]["Dense_1"]["kernel"][:, :2] + 1.0)
     np.testing.assert_array_equal(changed["kernel"][:, 2:], decoder["params"]["mlp"]["Dense_1"]["kernel"][:, 2:])
 
@@ -206,8 +210,8 @@ def test_a_sled_learns_to_go_where_its_codes_say_and_keeps_its_other_networks(mo
     assert metrics["mean/speed_along"] > 0.5 > 0.2 > first["mean/speed_along"]
     np.testing.assert_allclose(state.obs_statistics.mean, 0.0, atol=1e-3)
     np.testing.assert_allclose(state.obs_statistics.std, 1.0, atol=1e-3)
-    practised = model.with_decoder(practise.decoder_of(state.params.actor, model.params["decoder"]))
-    refitted, losses = jax.jit(partial(practise.refit, OPTIONS, PRACTICE, SLED))(practised, jax.random.key(3))
+    practised = model.with_decoder(practise.decoder_of(state.learnt.policy.actor, model.params["decoder"]))
+    refitted, losses = jax.jit(partial(refit, OPTIONS, PRACTICE, SLED))(practised, jax.random.key(3))
     assert_trees_equal(refitted.params["decoder"], practised.params["decoder"])
     assert read(refitted) > 0.6 > 0.4 > read(practised), "E reads the code from the actions, but not how long it is"
     assert np.mean(losses["prediction_loss"][-20:]) < 0.5 * np.mean(losses["prediction_loss"][:20])
@@ -223,20 +227,27 @@ def read(model):
     return np.corrcoef(np.ravel(means), np.ravel(codes))[0, 1]
 
 
-VALID = {"options__decoder": "closed", "options__frame": "heading", "options__way_weight": 8, "practise__ticks": 16}
+VALID = {
+    "options__decoder": "closed", "options__squash": True, "options__frame": "heading", "options__way_weight": 8,
+    "practise__ticks": 16,
+}  # fmt: skip
+SAC = SACConfig(num_envs=2, rollout_length=8, update_every=4, capacity=32, batch_size=4, warmup=0)
 
 
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
         ({"options__decoder": "open"}, "options.decoder: expected closed with practise.ticks, since an open-loop D"),
+        ({"options__squash": False}, "options.squash: expected True with practise.ticks, since D is the actor of SAC"),
+        ({"practise__sac__relabel": 4}, "practise.sac.relabel: expected 0, since a code is no goal"),
+        ({"practise__sac__update_every": 3}, "practise.sac.update_every: expected a divisor"),
         ({"options__frame": "world"}, "options.frame: expected heading with practise.ticks, from which"),
         ({"options__way_weight": 0}, "options.way_weight: expected 16 with practise.ticks, so that P tells"),
         ({"practise__ticks": 15}, "practise.ticks: expected at least one iteration"),
     ],
 )
 def test_what_cannot_be_practised_is_refused(fields, message):
-    config = with_fields(dataclasses.replace(CONFIG, practise=PractiseConfig(ppo=PPO)), **VALID)
+    config = with_fields(dataclasses.replace(CONFIG, practise=PractiseConfig(sac=SAC)), **VALID)
     validate(config)
     with pytest.raises(ConfigError) as error:
         validate(with_fields(config, **fields))
@@ -244,7 +255,7 @@ def test_what_cannot_be_practised_is_refused(fields, message):
 
 
 RUN = with_fields(
-    dataclasses.replace(CONFIG, practise=PractiseConfig(refit_steps=3, ppo=PPO)),
+    dataclasses.replace(CONFIG, practise=PractiseConfig(refit_steps=3, sac=SAC)),
     **VALID | {"practise__ticks": 40, "options__decoder_sizes": (4,)},
     env__name=f"{Path(__file__).parents[1] / 'sled.py'}:Sled",
 )  # fmt: skip
@@ -273,6 +284,7 @@ def test_a_run_practises_between_learn_and_train(finished):
     assert_trees_equal(taic.load(finished).options.rows.params, model.params)
     lines = plan(RUN, env, env).splitlines()
     assert "practise sled: 32 ticks x 2 seeds in 2 iterations" in lines
+    assert any(line.startswith("memory   replay of practise") for line in lines)
     assert pretraining(read_run(finished), "train") == (80, [])
 
 

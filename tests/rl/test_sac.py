@@ -129,6 +129,22 @@ def test_the_number_of_gradient_steps_is_that_of_decisions_after_the_warm_up(eve
     assert learnt_from > 100
 
 
+@pytest.mark.parametrize("decays", [False, True])
+def test_the_step_size_decays_to_zero_over_the_stage(decays):
+    """By the first critics' change in Adam's first step, which is the step size: half of it half-way, then none."""
+    config = as_arrays(dataclasses.replace(CONFIG, warmup=0, updates_per_decision=0.05, learning_rate_decay=decays))
+    env, changes = Counting(5), []
+    for iteration in (0, 2, 4):
+        state = sac.init(config, env, Repeat(3), jax.random.key(0)).replace(iteration=jnp.int32(iteration))
+        after = sac.iterate(config, env, Repeat(3), 4, state)[0]
+        assert int(after.learnt.optimizer.count) > 0
+        leaves = zip(*(jax.tree.leaves(x.learnt.critics) for x in (state, after)), strict=True)
+        changes.append(max(float(jnp.abs(a - b).max()) for a, b in leaves))
+    first, half, none = changes
+    assert first > 0 and half == pytest.approx(0.5 * first if decays else first, rel=0.1)
+    assert none == (0.0 if decays else pytest.approx(first, rel=0.1))
+
+
 def test_options_are_uniform_before_the_warm_up_is_over():
     config, env = as_arrays(dataclasses.replace(CONFIG, num_envs=64)), Counting(5)
     state = sac.init(config, env, Repeat(3), jax.random.key(0))
