@@ -152,11 +152,6 @@ class PractiseConfig:
     """Gradient steps at the end that refit E, P and F to D."""
     # Hidden layers are those of D.
     sac: SACConfig = SACConfig(
-        warmup=0,
-        update_every=8,
-        updates_per_decision=0.5,
-        batch_size=64,
-        learning_rate=1e-3,
+        warmup=0, update_every=8, updates_per_decision=0.5, batch_size=64, learning_rate=1e-3, temperature=0.1,
         learning_rate_decay=True,
-        temperature=0.1,
-    )
+    )  # fmt: skip

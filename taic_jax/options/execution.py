@@ -116,10 +116,13 @@ class OptionExecutor(struct.PyTreeNode):
 
     def start(self, option: Float[Array, " M"], obs: Float[Array, " S"]) -> Decoding:
         """Set D's carry from the code."""
-        state = self._state(obs, None)
-        code, view = leading(self.model, option, state) if self.by_way else (self.code(option), None)
+        code, view = self._chosen(option, self._state(obs, None))
         carry = self._decoder(code, method="start")
         return Decoding(code, carry, self.termination.start(self.model, self._state(obs, view)), view)
+
+    def _chosen(self, option: Float[Array, " M"], state: Float[Array, " P"]) -> tuple[Float[Array, " D"], Any]:
+        """Return the code of an option, and its view if it has one."""
+        return leading(self.model, option, state) if self.by_way else (self.code(option), None)
 
     def act(self, carry: Decoding, obs: Float[Array, " S"], noise: Float[Array, " X"]) -> tuple[Decoding, Array]:
         """Emit D's next action, with any noise, clipped to its bounds or one-hot."""

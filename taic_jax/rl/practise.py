@@ -1,8 +1,8 @@
 """Practice: D is refined by acting on open ground, so that a code leads where it says from every start.
 
 Codes from the prior are held for one or more options each. D is the mean of the actor of flat SAC: its input is the
-observation of the task `Practising`. A code says where it leads by P, as learnt
-before: the way that P predicts from the mean state.
+observation of the task `Practising`. A code says where it leads by P, as learnt before: the way that P predicts from
+the mean state.
 """
 
 import dataclasses

@@ -12,7 +12,7 @@ from taic_jax.config import OptionsConfig, PractiseConfig
 from taic_jax.envs.base import Env
 from taic_jax.envs.wrappers import AutoReset
 from taic_jax.options.dataset import Window, gather
-from taic_jax.options.execution import Decoding, OptionExecutor, make_executor
+from taic_jax.options.execution import OptionExecutor, make_executor
 from taic_jax.options.learning import descend
 from taic_jax.options.losses import adversarial_loss, prediction_loss
 from taic_jax.options.model import OptionModel
@@ -38,13 +38,14 @@ def refit(
     ticks = REFIT_OPTIONS * options.length
     _, run = rollout(env, executor, lambda obs, noise: (noise, jnp.zeros(len(obs))), begin, key_run, ticks)
     own = refresh.own_options(run, model)
+    recorded = own.windows.replace(views=model.views)
 
     def step(state: Any, key: Array) -> tuple[Any, dict[str, Array]]:
         which = jax.random.randint(key, (options.batch_size,), 0, own.windows.count)
-        windows = gather(own.windows, which, own.duration[which], options.length)
-        codes = own.code[which]
-        windows = jax.vmap(partial(seen_in_view, model))(windows, codes)
-        return descend(refit_loss, options, model, state, windows, codes[:, :-1])
+        drawn = own.code[which]
+        view = jax.vmap(partial(view_of, model))(drawn)
+        windows = gather(recorded, which, own.duration[which], options.length, view)
+        return descend(refit_loss, options, model, state, windows, drawn[:, :-1])
 
     learnt, losses = jax.lax.scan(
         step, refresh.init(options, model, key), jax.random.split(key_steps, config.refit_steps)
@@ -60,27 +61,16 @@ class AnyView(OptionExecutor):
         """D + 1."""
         return super().option_size + 1
 
-    def start(self, option: Float[Array, " M"], obs: Float[Array, " S"]) -> Decoding:
-        """Set D's carry from the code."""
-        if not self.model.views:
-            return super().start(option[:-1], obs)
-        view, code = view_of(self.model, option), option[:-1]
-        memory = self.termination.start(self.model, self._state(obs, view))
-        return Decoding(code, self._decoder(code, method="start"), memory, view)
+    def _chosen(self, option: Float[Array, " M"], state: Float[Array, " P"]) -> tuple[Float[Array, " D"], Any]:
+        return option[:-1], view_of(self.model, option)
 
 
-def view_of(model: OptionModel, option: Float[Array, " M"]) -> Int[Array, ""]:
-    """Return the view of an option of `AnyView`."""
+def view_of(model: OptionModel, option: Float[Array, " M"]) -> Int[Array, ""] | None:
+    """Return the view of an option of `AnyView`, None for a model without views."""
+    if not model.views:
+        return None
     share = jax.scipy.stats.norm.cdf(option[-1])
     return jnp.minimum((share * model.sides).astype(jnp.int32), model.sides - 1)
-
-
-def seen_in_view(model: OptionModel, window: Window, option: Float[Array, " M"]) -> Window:
-    """Return the window of an option of `AnyView` as D saw it."""
-    if not model.views:
-        return window
-    view = view_of(model, option)
-    return window.replace(states=model.views.obs(view, window.states), actions=model.views.action(view, window.actions))
 
 
 def refit_loss(
