@@ -37,6 +37,10 @@ class Views(struct.PyTreeNode):
         """Return proprioceptive slices in a view."""
         return obs[..., self.obs_order[view]] * jnp.broadcast_to(self.obs_sign[view], obs.shape)
 
+    def all(self, obs: Float[Array, " P"]) -> Float[Array, "V P"]:
+        """Return a proprioceptive slice in every view."""
+        return obs[self.obs_order] * self.obs_sign
+
     def action(self, view: Int[Array, ""], action: Float[Array, "*batch A"]) -> Float[Array, "*batch A"]:
         """Return actions in a view."""
         return action[..., self.action_order[view]] * jnp.broadcast_to(self.action_sign[view], action.shape)

@@ -112,8 +112,8 @@ class _Graph:
                 begin = self.add("Concat", [self.add("Unsqueeze", [x, axis])[0] for x in inputs[1:]], axis=0)
                 begin = self.add("Cast", begin, to=onnx.TensorProto.INT64)
                 return self.add("Slice", [inputs[0], *begin, *self.add("Add", [*begin, self.constant(sizes)])])
-            case "gather" if params["slice_sizes"] == (1,):  # of a vector, by indices [N, 1]
-                return self.add("Gather", [inputs[0], *self.add("Squeeze", [inputs[1], self.constant([1])])])
+            case "gather" if params["slice_sizes"] == (1,):  # of a vector, by indices [..., 1]
+                return self.add("Gather", [inputs[0], *self.add("Squeeze", [inputs[1], self.constant([-1])])])
             case "stack":
                 rows = [self.add("Unsqueeze", [x, self.constant([params["axis"]])])[0] for x in inputs]
                 return self.add("Concat", rows, axis=params["axis"])

@@ -32,10 +32,10 @@ def leading(
     frame: Any = model.networks.frame
     codes = jnp.asarray(menu(model.networks.encoder.option_size))
 
-    def gains(view: Int[Array, ""], direction: Float[Array, " 2"]) -> Float[Array, " 64"]:
-        seen = model.views.obs(view, state)
-        return jax.vmap(partial(model.way, model.see(seen, seen)))(codes) @ direction
+    def ways(seen: Float[Array, " P"]) -> Float[Array, "64 2"]:
+        return jax.vmap(partial(model.way, model.see(seen, seen)))(codes)
 
-    gain = jax.vmap(gains)(jnp.arange(len(model.views)), model.views.directions(frame.turned(way, state)))
+    directions = model.views.directions(frame.turned(way, state))
+    gain = jnp.sum(jax.vmap(ways)(model.views.all(state)) * directions[:, None], axis=-1)
     view = jnp.argmax(jnp.max(gain, axis=1)).astype(jnp.int32)
     return codes[jnp.argmax(gain[view])], view
