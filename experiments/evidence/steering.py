@@ -14,12 +14,16 @@ from typing import Any
 import jax
 import numpy as np
 import tyro
+from jaxtyping import Array
 
+from taic_jax.analysis.measures import distance_correlation
+from taic_jax.analysis.option_space import execute
 from taic_jax.artifacts.models import load_options
 from taic_jax.command_line import tell
 from taic_jax.config import Config, ConfigError
 from taic_jax.envs import make_env
 from taic_jax.envs.base import Env
+from taic_jax.experiments.evidence.measures import COUNT
 from taic_jax.experiments.evidence.navigate import (
     measure_codes,
     measures_of,
@@ -68,11 +72,12 @@ def navigation_of(folder: Path, picture: Path | None = None) -> dict[str, np.nda
     arenas: dict[str, Any] = {name: make_env(name, config.env.backend, body=body) for name in ARENAS}
     rows = []
     for seed, executor in enumerate(executors):
-        key_codes, key_run = jax.random.split(jax.random.key(config.seed + seed))
+        key_codes, key_run, key_order = jax.random.split(jax.random.key(config.seed + seed), 3)
         frame = None if executor.by_way else executor.model.networks.frame  # ways are in the world's axes
         compass = jax.device_get(measure_codes(ground, executor, frame, key_codes))
-        ticks = {name: jax.device_get(navigate(env, executor, compass, frame, key_run)) for name, env in arenas.items()}
-        measures = {"codes": measures_of_codes(compass)} | {
+        leading = None if executor.by_way else compass
+        ticks = {name: jax.device_get(navigate(env, executor, leading, frame, key_run)) for name, env in arenas.items()}
+        measures = {"codes": measures_of_codes(compass) | orders(ground, config, executor, key_order)} | {
             name: measures_of(run, arenas[name].dt) for name, run in ticks.items()
         }
         rows.append({f"{name}/{key}": x for name, values in measures.items() for key, x in values.items()})
@@ -80,6 +85,15 @@ def navigation_of(folder: Path, picture: Path | None = None) -> dict[str, np.nda
             ways = {n: (arenas[n].arena, run.extras[1], measures[n]["success"]) for n, run in ticks.items()}
             draw_navigation(compass, ways, picture)
     return {name: np.array([row[name] for row in rows]) for name in rows[0]}
+
+
+def orders(ground: Env, config: Config, executor: OptionExecutor, key: Array) -> dict[str, float]:
+    """Return the distance correlation of codes from the prior and the ways they lead, from one start and from many."""
+    by_code = make_executor(as_arrays(dataclasses.replace(config.options, choose="code")), executor.model)
+    (key_codes, key_run), run = jax.random.split(key), jax.jit(execute, static_argnums=(0, 4))
+    codes = jax.random.normal(key_codes, (COUNT, by_code.option_size))
+    effects = {name: run(ground, by_code, codes, key_run, many) for name, many in (("one", False), ("many", True))}
+    return {f"order_{name}": distance_correlation(codes, x.way) for name, x in effects.items()}
 
 
 def reference_levels() -> dict[str, dict[str, float]]:

@@ -22,6 +22,8 @@ MINIMA = {"gate": FRESH_SEEDS} | {f"without-{part}": LEFT_OUT_SEEDS for part in 
 MEASURES = (
     "codes/speed",
     "codes/agreement",
+    "codes/order_one",
+    "codes/order_many",
     *(f"{name}/{m}" for m in ("success", "overturned_per_1000") for name in ARENAS),
 )
 PASSED, OVERTURNED = 0.8, 0.2  # Least success in each arena, and most overturned in 1000 ticks, of options that pass.

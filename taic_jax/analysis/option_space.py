@@ -15,6 +15,7 @@ from taic_jax.envs.base import Env, State
 from taic_jax.envs.wrappers import AutoReset
 from taic_jax.options.dataset import Experience, gather, make_dataset
 from taic_jax.options.execution import Executor, make_executor
+from taic_jax.options.frame import Frame
 from taic_jax.options.model import OptionModel
 from taic_jax.rl.rollout import rollout, start
 from taic_jax.types import as_arrays
@@ -23,12 +24,14 @@ WARM_UP = 100  # ticks of random options before a measure from many states: thes
 
 
 class Effects(struct.PyTreeNode):
-    """N options, the proprioceptive slices they began and ended in, and the ticks they took."""
+    """N options, the proprioceptive slices they began and ended in, the ticks they took, and the way of a body with a
+    heading in m, seen from its heading at the start."""
 
     option: Array
     start: Array
     end: Array
     ticks: Array
+    way: Array | None  # [N, 2]
 
 
 def execute(
@@ -50,7 +53,11 @@ def execute(
     _, ticks = rollout(env, executor, partial(always, option), begin, key_noise, executor.length)
     last, size = jnp.argmax(ticks.ended, axis=0), env.proprioceptive_size
     end = jnp.take_along_axis(ticks.final_obs, last[None, :, None], axis=0)[0]
-    return Effects(option, ticks.obs[0, :, :size], end[:, :size], last + 1)
+    states, way = ticks.obs[..., :size], None
+    if env.heading:
+        steps = Frame(env.heading, turns=True, weight=1).way(states, states[:1])
+        way = jnp.sum(steps, axis=0, where=(jnp.arange(executor.length)[:, None] <= last[None])[..., None])
+    return Effects(option, states[0], end[:, :size], last + 1, way)
 
 
 def replay(

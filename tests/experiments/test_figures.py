@@ -161,7 +161,7 @@ def test_the_style_of_figures_is_theirs_alone():
 
 def test_the_gate_counts_the_models_that_pass(table, tmp_path):
     """Of three models the second overturns ants before the block, and the third does not cross the chasm."""
-    good = {"codes/speed": 1.3, "codes/agreement": 0.97}
+    good = {"codes/speed": 1.3, "codes/agreement": 0.97, "codes/order_one": 0.2, "codes/order_many": 0.1}
     good |= {
         f"{name}/{measure}": x for name in ARENAS for measure, x in (("success", 0.8), ("overturned_per_1000", 0.2))
     }
@@ -172,7 +172,7 @@ def test_the_gate_counts_the_models_that_pass(table, tmp_path):
     assert main(["gate", "--table", written(table, row), "--out", str(out)]) == 0
     with out.open() as file:
         lines = {line["measure"]: line for line in csv.DictReader(file)}
-    assert len(lines) == 2 + 2 * len(ARENAS) + 2 and lines["codes/speed"]["remarks"] == "3 of 10 seeds"
+    assert len(lines) == 4 + 2 * len(ARENAS) + 2 and lines["codes/speed"]["remarks"] == "3 of 10 seeds"
     assert lines["reach"]["per_seed"] == "1 1 0" and lines["pass"]["per_seed"] == "1 0 0"
     assert float(lines["ant_fall/success"]["low"]) >= 0.7 and lines["ant_fall/success"]["iqm"] != ""
     assert main(["gate", "--table", str(tmp_path / "none.jsonl"), "--out", str(tmp_path / "no.csv")]) == 2

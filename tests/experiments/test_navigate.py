@@ -9,6 +9,7 @@ import pytest
 from PIL import Image
 from probes import NO, Probe, Repeat
 
+from taic_jax.analysis.option_space import execute
 from taic_jax.envs import State
 from taic_jax.envs.arenas import FALL, MAZE, PUSH
 from taic_jax.envs.base import Heading, PhysicsState
@@ -77,6 +78,18 @@ def test_the_widest_gap_is_between_fast_and_safe_codes():
     assert navigate.measures_of_codes(compass._replace(velocity=0.1 * velocity))["widest_gap"] == 360
 
 
+@pytest.mark.parametrize("many", [False, True])
+def test_the_way_of_an_option_is_seen_from_the_heading_at_its_start(many):
+    codes = jax.random.normal(jax.random.key(0), (20, 2))
+    effects = execute(Skater(True), Repeat(20, option_size=2), codes, jax.random.key(1), many)
+    expected = 3 * 0.05 * np.clip(codes, -1, 1)
+    if many:  # the first tick goes on as the option before
+        last = effects.way - 19 * expected
+        assert np.abs(last).max() <= 3 * 0.05 * np.sqrt(2) + 1e-4 and np.abs(last).min(axis=1).max() > 0.01
+    else:
+        np.testing.assert_allclose(effects.way, 19 * expected, atol=1e-4)
+
+
 @pytest.mark.parametrize("turns", [False, True])
 def test_a_skater_is_led_through_the_maze(turns, monkeypatch):
     monkeypatch.setattr(navigate, "EPISODES", 3)
@@ -87,6 +100,16 @@ def test_a_skater_is_led_through_the_maze(turns, monkeypatch):
     assert measures["success"] == measures["ever"] == 1 and measures["speed"] > 1
     lost = navigate.navigate(env, executor, compass, Frame(HEADING, not turns, 0), jax.random.key(1))
     assert navigate.measures_of(lost, env.dt)["success"] == 0, "a compass read in the wrong frame leads astray"
+
+
+def test_options_that_are_ways_are_given_the_way(monkeypatch):
+    monkeypatch.setattr(navigate, "EPISODES", 1)
+    env = Skater(walls=MAZE.solids)
+    run = navigate.navigate(env, Repeat(20, option_size=2), None, None, jax.random.key(1))
+    places = np.concatenate([[[0.0, 0.0]], run.extras[1][:-1, 0]])
+    expected = navigate.way_of(MAZE, jnp.asarray(places, jnp.float32))
+    np.testing.assert_allclose(run.option[::20, 0], expected[::20], atol=1e-5)
+    assert navigate.measures_of(run, env.dt)["success"] == 1
 
 
 def test_risky_codes_are_avoided(monkeypatch):
