@@ -30,8 +30,9 @@ Spec = tuple[tuple[int, ...], np.dtype]
 VERSION, CHECKSUMS, LAYOUT = "taic_jax", "crc32", "layout"  # keys of the metadata
 PACKED = "bytes"  # the one array of a checkpoint
 
-# Orbax's threads also log its errors, in hundreds of lines.
-logging.getLogger("absl").addFilter(lambda record: "orbax" not in Path(record.pathname).parts)
+# Orbax's threads also log its errors, in hundreds of lines. A logger that is made before absl is imported, as here,
+# names absl's file in place of the caller's.
+logging.getLogger("absl").addFilter(lambda record: not {"orbax", "absl"} & {*Path(record.pathname).parts})
 
 
 class ArtifactError(ValueError):

@@ -269,3 +269,19 @@ def test_a_disk_that_fills_while_orbax_writes_is_told_when_it_is_waited_for(tmp_
     checkpoints.wait()
     assert checkpoints.steps() == [2]
     assert not caplog.records
+
+
+LOG_FROM = """
+import taic_jax.runtime.checkpoint
+import absl.logging
+place = "orbax/x.py"
+exec(compile("absl.logging.error(place)", place, "exec"))
+import logging
+logging.getLogger("other").error("heard")
+"""
+
+
+def test_orbax_does_not_log_to_the_terminal():
+    """Though absl's logger is made before absl knows who calls."""
+    run = subprocess.run([sys.executable, "-c", LOG_FROM], capture_output=True, text=True, check=True)
+    assert "orbax/x.py" not in run.stderr and "heard" in run.stderr
