@@ -4,7 +4,7 @@ import math
 from operator import ge, le
 from typing import Annotated, Any, get_args, get_origin
 
-from taic_jax.config import USUAL_BOUNDS, Config, field_types, impossible, walk
+from taic_jax.config import USUAL_BOUNDS, Config, SACConfig, field_types, impossible, walk
 
 REPLAYS = ("collect.sac", "collect.dqn", "practise.sac", "train.sac", "train.dqn")
 
@@ -79,8 +79,12 @@ def _check_learners(config: Config) -> None:
     ):
         if applies and learner != "ppo":
             raise impossible(name, learner, needed, "ppo")
-    if config.practise.sac.relabel:
-        raise impossible("practise.sac.relabel", config.practise.sac.relabel, "0, since a code is no goal", 0)
+    practised, own = config.practise.sac, SACConfig().hidden_sizes
+    if practised.relabel:
+        raise impossible("practise.sac.relabel", practised.relabel, "0, since a code is no goal", 0)
+    if practised.hidden_sizes != own:
+        expected = f"{own}, unused: D's are options.decoder_sizes"
+        raise impossible("practise.sac.hidden_sizes", practised.hidden_sizes, expected, own)
     values = dict(walk(config))
     for name in REPLAYS:
         fields = ("num_envs", "update_every", "rollout_length", "capacity")

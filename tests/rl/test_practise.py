@@ -240,6 +240,7 @@ SAC = SACConfig(num_envs=2, rollout_length=8, update_every=4, capacity=32, batch
         ({"options__decoder": "open"}, "options.decoder: expected closed with practise.ticks, since an open-loop D"),
         ({"options__squash": False}, "options.squash: expected True with practise.ticks, since D is the actor of SAC"),
         ({"practise__sac__relabel": 4}, "practise.sac.relabel: expected 0, since a code is no goal"),
+        ({"practise__sac__hidden_sizes": (8,)}, "practise.sac.hidden_sizes: expected (256, 256), unused: D's are"),
         ({"practise__sac__update_every": 3}, "practise.sac.update_every: expected a divisor"),
         ({"options__frame": "world"}, "options.frame: expected heading with practise.ticks, from which"),
         ({"options__way_weight": 0}, "options.way_weight: expected 16 with practise.ticks, so that P tells"),
