@@ -2,6 +2,7 @@
 
 import csv
 
+import numpy as np
 import pytest
 from tiny_runs import CONFIG, with_fields
 from written_runs import write_options, write_run
@@ -20,6 +21,8 @@ def test_ants_are_led_through_all_arenas(tmp_path, monkeypatch):
         rows = {(row["run"], row["measure"]): row for row in csv.DictReader(file)}
     measured = {name.partition("/")[0] for run, name in rows if run.endswith("/run")}
     assert measured == {"codes", "ant_maze", "ant_push", "ant_fall"} and picture.stat().st_size > 5000
+    orders = [float(rows[f"{tmp_path.name}/run", f"codes/order_{starts}"]["iqm"]) for starts in ("one", "many")]
+    assert 0 < max(np.abs(orders)) < 1 and orders[0] > orders[1], "many starts blur what even random weights obey"
     stand, went = (float(rows[x, "ant_maze/final_distance"]["iqm"]) for x in ("stand", f"{tmp_path.name}/run"))
     assert stand == 16 and abs(went - 16) < 4  # actions at random lead nowhere
     assert all(len(row["per_seed"].split()) == 2 for (run, _), row in rows.items() if run.endswith("/run"))

@@ -51,8 +51,6 @@ PRACTICE = PractiseConfig(
     sac=SACConfig(rollout_length=32, update_every=8, updates_per_decision=0.25, batch_size=64, warmup=0,
                   temperature=0.1, learning_rate=1e-3),
 )  # fmt: skip
-
-
 SLED = TimeLimit(Sled(), 50)
 
 
