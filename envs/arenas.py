@@ -93,7 +93,7 @@ FALL = Arena(
     solids=((-4.0, -4.0, 12.0, 12.0), (-4.0, 20.0, 12.0, 28.0)),  # platforms before and behind a chasm 4 m deep
     goal=(0.0, 27.0, 4.5),
     # Push the block into the chasm, and go over it.
-    ways=(((-4, -4, 6, 12), (8, 0)), ((4, -4, 12, 21), (8, 24)), ((-4, 12, 12, 28), (0, 27))),
+    ways=(((-4, -4, 5, 12), (8, 0)), ((4, -4, 12, 21), (8, 24)), ((-4, 12, 12, 28), (0, 27))),
     ground=4.0,
     block=Block(centre=(8.0, 8.0, 6.0), slides=(_ALONG_Y, _DOWN), meets=(0,)),
 )

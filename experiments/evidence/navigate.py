@@ -1,7 +1,7 @@
 """A navigator without learning, which leads an ant through an arena by its options: a gate before long runs.
 
 Codes are measured on open ground. Then, at every decision, the navigator takes the one that leads best to the next
-place on the arena's way, and seldom overturns the ant. An arena is within reach of a policy over these options if it
+place on the arena's way, and seldom overturns the ant; options that are chosen by their way are given it. An arena is within reach of a policy over these options if it
 is within reach of the navigator.
 """
 
@@ -105,13 +105,21 @@ def next_place(arena: Arena, place: Float[Array, "B 2"]) -> Float[Array, "B 2"]:
 
 
 @partial(jax.jit, static_argnums=(0, 3))
-def navigate(env: Any, executor: Executor, compass: Compass, frame: Frame | None, key: Key[Array, ""]) -> Rollout:
-    """Return an episode each of several ants that the compass leads; the extras are metrics, and places [T, B, 2]."""
+def navigate(
+    env: Any, executor: Executor, compass: Compass | None, frame: Frame | None, key: Key[Array, ""]
+) -> Rollout:
+    """Return an episode each of several ants that the compass leads, or that are given the way if there is none.
+
+    The extras are metrics, and places [T, B, 2].
+    """
     size, turning = env.proprioceptive_size, Frame(env.heading, bool(frame and frame.turns), 1)
 
     def decide(obs: Array, noise: Array) -> tuple[Array, Array]:
         place = obs[:, size : size + 2]
-        way = turning.turned(way_of(env.arena, place), obs[:, :size])
+        way = way_of(env.arena, place)
+        if compass is None:
+            return way, jnp.zeros(len(obs))
+        way = turning.turned(way, obs[:, :size])
         score = way @ compass.velocity.T - RISK * compass.overturned[None]
         return compass.codes[jnp.argmax(score, axis=1)], jnp.zeros(len(obs))
 

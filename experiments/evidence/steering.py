@@ -71,7 +71,8 @@ def navigation_of(folder: Path, picture: Path | None = None) -> dict[str, np.nda
         key_codes, key_run = jax.random.split(jax.random.key(config.seed + seed))
         frame = None if executor.by_way else executor.model.networks.frame  # ways are in the world's axes
         compass = jax.device_get(measure_codes(ground, executor, frame, key_codes))
-        ticks = {name: jax.device_get(navigate(env, executor, compass, frame, key_run)) for name, env in arenas.items()}
+        leading = None if executor.by_way else compass
+        ticks = {name: jax.device_get(navigate(env, executor, leading, frame, key_run)) for name, env in arenas.items()}
         measures = {"codes": measures_of_codes(compass)} | {
             name: measures_of(run, arenas[name].dt) for name, run in ticks.items()
         }

@@ -25,7 +25,7 @@ def menu(size: int) -> Float[np.ndarray, "64 D"]:
 def leading(
     model: OptionModel, way: Float[Array, " 2"], state: Float[Array, " P"]
 ) -> tuple[Float[Array, " D"], Int[Array, ""]]:
-    """Return the code and the view of the body that lead farthest along a way in the world's axes.
+    """Return the code and the view of the body that lead farthest along a way in the world's axes, and least aside.
 
     P predicts the ways of codes from this state in every view; the length of `way` does not matter.
     """
@@ -35,7 +35,9 @@ def leading(
     def ways(seen: Float[Array, " P"]) -> Float[Array, "64 2"]:
         return jax.vmap(partial(model.way, model.see(seen, seen)))(codes)
 
-    directions = model.views.directions(frame.turned(way, state))
-    gain = jnp.sum(jax.vmap(ways)(model.views.all(state)) * directions[:, None], axis=-1)
+    ahead = model.views.directions(frame.turned(way, state))[:, None]
+    left = jnp.stack([-ahead[..., 1], ahead[..., 0]], axis=-1)
+    along, aside = (jnp.sum(jax.vmap(ways)(model.views.all(state)) * axis, axis=-1) for axis in (ahead, left))
+    gain = along - jnp.abs(aside)
     view = jnp.argmax(jnp.max(gain, axis=1)).astype(jnp.int32)
     return codes[jnp.argmax(gain[view])], view

@@ -73,6 +73,16 @@ def test_among_codes_that_lead_the_same_way_the_farthest_is_chosen(env, executor
     assert int(running.view) == 0
 
 
+def test_a_code_that_leads_farther_but_more_aside_is_not_chosen(env, executor, monkeypatch):
+    """By a P of which each metre more ahead costs one and a half to the side, or a half."""
+    codes = np.abs(menu(2)[:, 0])
+    for slope, chosen in ((1.5, np.argmin(codes)), (-0.5, np.argmax(codes))):
+        way = lambda _, state, code, slope=slope: jnp.abs(code[0]) * jnp.array([1.0, slope])  # noqa: E731
+        monkeypatch.setattr(OptionModel, "way", lambda *x, way=way: jnp.array([2.0, 0.0]) + way(*x))
+        running = executor.start(jnp.array([1.0, 0.0]), facing(env, 0.0))
+        np.testing.assert_allclose(running.option, menu(2)[chosen], rtol=1e-6)
+
+
 def test_the_menu_is_the_middle_of_the_prior():
     """Of four dimensions a quarter of the prior lies within 1.39, the root of a chi-squared quantile."""
     codes = menu(4)
