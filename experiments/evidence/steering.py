@@ -17,13 +17,12 @@ import tyro
 from jaxtyping import Array
 
 from taic_jax.analysis.measures import distance_correlation
-from taic_jax.analysis.option_space import execute
+from taic_jax.analysis.option_space import prior_effects
 from taic_jax.artifacts.models import load_options
 from taic_jax.command_line import tell
 from taic_jax.config import Config, ConfigError
 from taic_jax.envs import make_env
 from taic_jax.envs.base import Env
-from taic_jax.experiments.evidence.measures import COUNT
 from taic_jax.experiments.evidence.navigate import (
     measure_codes,
     measures_of,
@@ -89,11 +88,9 @@ def navigation_of(folder: Path, picture: Path | None = None) -> dict[str, np.nda
 
 def orders(ground: Env, config: Config, executor: OptionExecutor, key: Array) -> dict[str, float]:
     """Return the distance correlation of codes from the prior and the ways they lead, from one start and from many."""
-    by_code = make_executor(as_arrays(dataclasses.replace(config.options, choose="code")), executor.model)
-    (key_codes, key_run), run = jax.random.split(key), jax.jit(execute, static_argnums=(0, 4))
-    codes = jax.random.normal(key_codes, (COUNT, by_code.option_size))
-    effects = {name: run(ground, by_code, codes, key_run, many) for name, many in (("one", False), ("many", True))}
-    return {f"order_{name}": distance_correlation(codes, x.way) for name, x in effects.items()}
+    args = ground, dataclasses.replace(config.options, choose="code"), executor.model, key
+    effects = {name: prior_effects(*args, many=many) for name, many in (("one", False), ("many", True))}
+    return {f"order_{name}": distance_correlation(x.option, x.way) for name, x in effects.items()}
 
 
 def reference_levels() -> dict[str, dict[str, float]]:

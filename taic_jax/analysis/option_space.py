@@ -6,6 +6,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, Int, Key
 
@@ -85,14 +86,21 @@ def always(option: Float[Array, "B D"], obs: Float[Array, "B S"], noise: Array) 
     return option, jnp.zeros(len(option))
 
 
-def order(env: Env, config: OptionsConfig, model: OptionModel, key: Key[Array, ""], count: int = 500) -> float:
-    """Return the distance correlation of options from the prior and the changes they cause in one state."""
+def prior_effects(
+    env: Env, config: OptionsConfig, model: OptionModel, key: Key[Array, ""], count: int = 500, many: bool = False
+) -> Effects:
+    """Execute options from the prior, see `execute`."""
     key_prior, key_run = jax.random.split(key)
     executor = make_executor(as_arrays(config), model)
     option = jax.random.normal(key_prior, (count, executor.option_size))
-    run = jax.jit(execute, static_argnums=0)  # one program for all models
-    effects = jax.device_get(run(env, executor, option, key_run))
-    change = effects.end - effects.start
+    run = jax.jit(execute, static_argnums=(0, 4))  # one program for all models
+    return jax.device_get(run(env, executor, option, key_run, many))
+
+
+def order(env: Env, config: OptionsConfig, model: OptionModel, key: Key[Array, ""], count: int = 500) -> float:
+    """Return the distance correlation of options from the prior and the changes they cause in one state."""
+    effects = prior_effects(env, config, model, key, count)
+    change = np.asarray(effects.end) - np.asarray(effects.start)
     return measures.distance_correlation(effects.option, measures.standardized(change, change))
 
 

@@ -77,8 +77,10 @@ def test_a_code_that_leads_farther_but_more_aside_is_not_chosen(env, executor, m
     """By a P of which each metre more ahead costs one and a half to the side, or a half."""
     codes = np.abs(menu(2)[:, 0])
     for slope, chosen in ((1.5, np.argmin(codes)), (-0.5, np.argmax(codes))):
-        way = lambda _, state, code, slope=slope: jnp.abs(code[0]) * jnp.array([1.0, slope])  # noqa: E731
-        monkeypatch.setattr(OptionModel, "way", lambda *x, way=way: jnp.array([2.0, 0.0]) + way(*x))
+        aside = jnp.array([1.0, slope])
+        monkeypatch.setattr(
+            OptionModel, "way", lambda *x, aside=aside: jnp.array([2.0, 0.0]) + jnp.abs(x[2][0]) * aside
+        )
         running = executor.start(jnp.array([1.0, 0.0]), facing(env, 0.0))
         np.testing.assert_allclose(running.option, menu(2)[chosen], rtol=1e-6)
 
