@@ -8,9 +8,18 @@ from probes import NO
 from taic_jax.envs import Env, State
 from taic_jax.envs.base import Heading
 
+NONE = jnp.zeros(())
+TURN = 0.2  # rad to the left in each tick
+
+
+def turned(vector, angle):
+    """Return vectors [..., 2] turned to the left."""
+    c, s, (x, y) = jnp.cos(angle), jnp.sin(angle), jnp.moveaxis(vector, -1, 0)
+    return jnp.stack([c * x - s * y, s * x + c * y], axis=-1)
+
 
 class Sled(Env):
-    """A sled that faces anywhere, whose action is its velocity in its own frame."""
+    """A sled that spins slowly, whose action is its velocity in its own frame."""
 
     name = proprioception = "sled"
     observation_size = proprioceptive_size = 6
@@ -25,11 +34,11 @@ class Sled(Env):
         return State.first(obs, obs, {})
 
     def step(self, state, action):
-        """Move at the velocity."""
-        w, z = state.obs[0], state.obs[3]
-        c, s = w**2 - z**2, 2 * w * z
-        velocity = jnp.stack([c * action[0] - s * action[1], s * action[0] + c * action[1]])
-        obs = state.obs.at[4:].set(velocity)
+        """Move at the velocity, and turn."""
+        yaw = 2.0 * jnp.arctan2(state.obs[3], state.obs[0])
+        half = (yaw + TURN) / 2.0
+        velocity = turned(action, yaw)
+        obs = jnp.stack([jnp.cos(half), NONE, NONE, jnp.sin(half), *velocity])
         return state.replace(physics=obs, obs=obs, terminated=NO, truncated=NO)
 
     def render(self, physics, *, height=240, width=320):

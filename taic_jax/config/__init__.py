@@ -138,8 +138,8 @@ class OptionsConfig:
     views: Literal["one", "all"] = "one"
     """Views of a window: the recorded one, or those of all the body's equal sides: the ant has four."""
     frame: Literal["world", "heading"] = "world"
-    """Axes in which E, D, P and F see a body that can face anywhere: the world's, or those of its heading, D at each
-    tick, the others at the option's first."""
+    """Axes in which E, D, P and F see a body that can face anywhere: the world's, or those of its heading at the
+    option's first tick."""
     choose: Literal["code", "way"] = "code"
     """Entries by which a policy chooses an option: its code, or the way that it shall lead in the world's axes; then
     the code and the side of the body as front are those of which P predicts that they lead farthest along it."""

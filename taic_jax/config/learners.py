@@ -153,5 +153,5 @@ class PractiseConfig:
     # Hidden layers are those of D.
     sac: SACConfig = SACConfig(
         warmup=0, update_every=8, updates_per_decision=0.5, batch_size=64, learning_rate=1e-3, temperature=0.1,
-        learning_rate_decay=True,
+        target_entropy=-0.5, learning_rate_decay=True,
     )  # fmt: skip

@@ -112,10 +112,10 @@ def make_dataset(
     ticks = jnp.arange(config.length + 1) if frame else jnp.array([0, config.length])
     windows = rows.obs[probe[:, None] + ticks[None]]
     windows = jax.vmap(views.obs, (0, None))(jnp.arange(len(views)), windows).reshape((-1, *windows.shape[1:]))
-    first, change = windows[:, 0], windows[:, -1] - windows[:, 0]
+    states, change = windows[:, 0], windows[:, -1] - windows[:, 0]
     if frame:
-        first, change = frame.seen(first, first), jax.vmap(frame.changes)(windows)[:, -1]
-    return Dataset(rows, starts, count, num_held_out, _scale(first), _scale(change, frame), views)
+        states, change = flatten(frame.seen(windows, windows[:, :1])), jax.vmap(frame.changes)(windows)[:, -1]
+    return Dataset(rows, starts, count, num_held_out, _scale(states), _scale(change, frame), views)
 
 
 def holds_out(config: OptionsConfig) -> bool:

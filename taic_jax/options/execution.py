@@ -73,12 +73,16 @@ class IdentityExecutor(struct.PyTreeNode):
 
 
 class Decoding(struct.PyTreeNode):
-    """A running option: its code, D's carry, the termination rule's memory of it, and its view if it has a way."""
+    """A running option: its code, D's carry, the termination rule's memory of it, and its view if it has a way.
+
+    `first` is the state in which it began, in its view, if D sees the body from the heading there.
+    """
 
     option: Array
     carry: Any
     memory: Any
     view: Any = None
+    first: Any = None
 
 
 class OptionExecutor(struct.PyTreeNode):
@@ -117,8 +121,9 @@ class OptionExecutor(struct.PyTreeNode):
     def start(self, option: Float[Array, " M"], obs: Float[Array, " S"]) -> Decoding:
         """Set D's carry from the code."""
         code, view = self._chosen(option, self._state(obs, None))
-        carry = self._decoder(code, method="start")
-        return Decoding(code, carry, self.termination.start(self.model, self._state(obs, view)), view)
+        carry, state, frame = self._decoder(code, method="start"), self._state(obs, view), self.model.networks.frame
+        first = state if frame and frame.turns else None
+        return Decoding(code, carry, self.termination.start(self.model, state), view, first)
 
     def _chosen(self, option: Float[Array, " M"], state: Float[Array, " P"]) -> tuple[Float[Array, " D"], Any]:
         """Return the code of an option, and its view if it has one."""
@@ -128,13 +133,13 @@ class OptionExecutor(struct.PyTreeNode):
         """Emit D's next action, with any noise, clipped to its bounds or one-hot."""
         state = self._state(obs, carry.view)
         next_carry, (output, end_logit) = self._decoder(
-            carry.carry, carry.option, self.model.see(state, state), method="step"
+            carry.carry, carry.option, self.model.see(state, carry.first), method="step"
         )
         action = self._action(output, noise[self.termination.noise_size :])
         followed = self.termination.follow(self.model, carry.memory, state, action, end_logit)
         if carry.view is not None:
             action = self.model.views.action(self.model.views.back(carry.view), action)
-        return Decoding(carry.option, next_carry, followed, carry.view), action
+        return carry.replace(carry=next_carry, memory=followed), action
 
     def ended(self, carry: Decoding, obs: Float[Array, " S"], noise: Float[Array, " X"]) -> Bool[Array, ""]:
         """Ask the termination rule."""

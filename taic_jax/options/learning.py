@@ -94,7 +94,7 @@ def window_losses(
     states = model.see(window.states, window.states[:1])
     if config.termination != "predict":
         prediction = prediction_loss(model.predict(states[0], option), model.changes(window.states)[last])
-    decoded, end_logit = model.decode(option, model.see(window.states[:-1], window.states[:-1]) + disturbance)
+    decoded, end_logit = model.decode(option, states[:-1] + disturbance)
     estimated = model.estimate(gradient_reversal(option, config.lambda_adv))
     losses = {
         "reconstruction_loss": reconstruction_loss(decoded, window.actions, mask, model.networks.discrete),

@@ -209,8 +209,8 @@ class OptionModel(struct.PyTreeNode):
         """Equal sides of the body, each a view in which an option can begin; 1 without options by their way."""
         return len(self.views) if self.views else 1
 
-    def see(self, states: Float[Array, "*batch P"], first: Float[Array, "*#batch P"]) -> Float[Array, "*batch P"]:
-        """Return normalised states, in the frame of the heading as seen from `first`, clipped there."""
+    def see(self, states: Float[Array, "*batch P"], first: Any) -> Float[Array, "*batch P"]:
+        """Return normalised states, in the frame of the heading as seen from `first` [*batch P], clipped there."""
         if not (frame := self.networks.frame):
             return self.state_scale(states)
         seen = self.state_scale(frame.seen(states, first))

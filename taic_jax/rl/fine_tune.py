@@ -18,7 +18,7 @@ from taic_jax.config import FineTuneConfig, PPOConfig
 from taic_jax.envs.base import Env
 from taic_jax.networks import apply
 from taic_jax.nonfinite import earliest, first_nonfinite
-from taic_jax.options.execution import OptionExecutor
+from taic_jax.options.execution import Decoding, OptionExecutor
 from taic_jax.options.model import OptionModel
 from taic_jax.rl import ppo
 from taic_jax.rl.returns import Judgement, semi_markov_advantages
@@ -114,7 +114,7 @@ def iterate(
     """
     noisy = tuned_executor(executor, tuned.decoder).replace(std=fine.std)
     after, metrics, ticks, judgement = ppo.iterate(config, env, noisy, num_iterations, state)
-    rows = _rows(config, noisy, state.running.option.option, ticks, judgement)
+    rows = _rows(config, noisy, state.running.option, ticks, judgement)
     learning_rate = ppo.step_size(config, fine.learning_rate, state.iteration, num_iterations)
     epoch = partial(_epoch, config, fine, learning_rate, executor, rows)
     key, key_update = jax.random.split(after.key)
@@ -127,15 +127,14 @@ def iterate(
     return after.replace(key=key), tuned, metrics
 
 
-def _rows(
-    config: PPOConfig, noisy: OptionExecutor, running: Float[Array, "B D"], ticks: Rollout, judgement: Judgement
-) -> Actions:
+def _rows(config: PPOConfig, noisy: OptionExecutor, running: Decoding, ticks: Rollout, judgement: Judgement) -> Actions:
     """Return every tick as a row, with the advantage of its action; `running` are the options at the first tick."""
     advantage = semi_markov_advantages(judgement, jnp.ones_like(ticks.ended), config.gamma, config.lambda_)
     model, tick = noisy.model, ticks.duration - 1
-    option = fill_options(noisy.code(ticks.option), ticks.decision, running)
+    option = fill_options(noisy.code(ticks.option), ticks.decision, running.option)
     states = ticks.obs[..., : model.state_size]
-    proprioception = model.see(states, states)
+    first = None if running.first is None else fill_options(states, ticks.decision, running.first)
+    proprioception = model.see(states, first)
     means = jax.vmap(jax.vmap(partial(mean_action, model, noisy.length)))(option, proprioception, tick)
     action = means + noisy.std * ticks.noise[..., -means.shape[-1] :]
     log_prob = jax.vmap(partial(_log_prob, std=noisy.std))(action, means)

@@ -45,9 +45,9 @@ class Practising(Wrapper):
     """A task whose observation is D's input: the state that D sees, a code from the prior, and the share of its ticks.
 
     The reward of a tick is the upward part of the body's own axis, less the costs of control and of change; and the
-    speed in m/s in the code's direction, seen from the heading and up to `speed`, less half the speed across it, or at
-    an option's end the information. Episodes end as those of the inner task, which resets itself: what resets a batch
-    under `vmap` may not read a model of its own in each row.
+    speed in m/s in the code's direction, up to `speed`, less half the speed across it, or at an option's end the
+    information. Directions are seen from the heading in which the option began. Episodes end as those of the inner
+    task, which resets itself: what resets a batch under `vmap` may not read a model of its own in each row.
     """
 
     def __init__(self, env: Env, options: OptionsConfig, config: PractiseConfig, model: OptionModel):
@@ -105,13 +105,13 @@ class Practising(Wrapper):
             code=code, direction=direction(self.model, practice.sector, code), left=left, tick=tick, key=key,
             view=jax.random.randint(key_view, (), 0, self.model.sides), way=jnp.zeros(2),
         )  # fmt: skip
-        first = self._state(practice, practice.inner.obs)
-        return practice.replace(first=first, obs=self._observe(practice, practice.inner.obs))
+        practice = practice.replace(first=self._state(practice, practice.inner.obs))
+        return practice.replace(obs=self._observe(practice, practice.inner.obs))
 
     def _observe(self, practice: PracticeState, obs: Float[Array, " I"]) -> Float[Array, " S"]:
         state = self._state(practice, obs)
         share = practice.tick.astype(jnp.float32) / self.options.length
-        return jnp.concatenate([self.model.see(state, state), practice.code, share[None]])
+        return jnp.concatenate([self.model.see(state, practice.first), practice.code, share[None]])
 
     def _state(self, practice: PracticeState, obs: Float[Array, " I"]) -> Float[Array, " P"]:
         state = obs[: self.model.state_size]
@@ -121,14 +121,13 @@ class Practising(Wrapper):
         self, before: PracticeState, state: Float[Array, " P"], action: Float[Array, " A"]
     ) -> tuple[Array, dict[str, Array]]:
         """Return reward and metrics of the tick; `before` has the way up to its end."""
-        config, first = self.config, self._state(before, before.inner.obs)
+        config, model, length, first = self.config, self.model, self.options.length, before.first
         velocity = self.frame.way(state, first) / self.dt
         along = velocity @ before.direction
         across = jnp.abs(velocity[0] * before.direction[1] - velocity[1] * before.direction[0])
         at = self.frame.heading.quaternion
         upright = 1 - 2 * (state[at + 1] ** 2 + state[at + 2] ** 2)
-        model, length = self.model, self.options.length
-        inputs = before.code, model.see(first, first), before.tick, length
+        inputs = before.code, model.see(self._state(before, before.inner.obs), first), before.tick, length
         as_learnt = apply(model.networks.decoder, model.params["decoder"], *inputs, method="at")
         reward = config.upright * upright - config.control_cost * jnp.sum(action**2)
         reward -= 0.5 * config.kl_weight * jnp.sum(jnp.square(action - as_learnt))

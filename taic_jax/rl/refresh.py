@@ -65,7 +65,7 @@ def own_options(ticks: Rollout, model: OptionModel) -> OwnOptions:
 
 def action_change(old: OptionModel, new: OptionModel, window: Window, code: Float[Array, " D"]) -> Float[Array, ""]:
     """Return the mean squared difference of two models' decoded actions for this code, in the window's own states."""
-    states = old.see(window.states[:-1], window.states[:-1])
+    states = old.see(window.states[:-1], window.states[:1])
     before, after = (model.decode(code, states)[0] for model in (old, new))
     return reconstruction_loss(after, before, window.mask)
 

@@ -113,12 +113,17 @@ def test_the_model_acts_and_predicts_alike_after_a_turn(walks, model):
     _, _, _, obs, _ = walks
     executor, option = make_executor(as_arrays(CONFIG), model), jnp.array([0.5, -1.0])
 
-    def act(state):
-        return executor.act(executor.start(option, state), state, jnp.zeros(0))[1]
+    def act(first, state):
+        return executor.act(executor.start(option, first), state, jnp.zeros(0))[1]
 
-    actions = jax.vmap(jax.vmap(act))(obs[:, :8])
+    actions = jax.vmap(jax.vmap(act, (None, 0)))(obs[:, 0], obs[:, :8])
     np.testing.assert_allclose(actions[1:], np.broadcast_to(actions[0], actions[1:].shape), atol=1e-2)
     assert np.abs(np.diff(actions[0], axis=0)).max() > 0.01
+    for state, action in zip(obs[0, :3], actions[0], strict=False):
+        decoded = model.decode(option, model.see(state, obs[0, 0])[None])[0][0]
+        np.testing.assert_allclose(action, jnp.clip(decoded, -1.0, 1.0), atol=1e-5)
+    other = jax.vmap(act, (0, None))(obs[:, 0], obs[0, 0])
+    assert np.abs(other[1:] - other[:1]).max() > 0.01, "D sees how far it has turned since the option began"
     predicted = jax.vmap(lambda s: model.predict(model.see(s, s), option))(obs[:, 0])
     assert predicted.shape == (4, 29)
     np.testing.assert_allclose(predicted[1:], np.broadcast_to(predicted[0], predicted[1:].shape), atol=1e-4)
@@ -127,13 +132,13 @@ def test_the_model_acts_and_predicts_alike_after_a_turn(walks, model):
 def test_scales_are_of_what_is_seen_and_the_way_counts_by_its_weight(walks, model):
     env, _, _, obs, _ = walks
     frame = make_frame(CONFIG, env.heading)
-    starts = obs[:, : TICKS - 5].reshape(-1, 27)
-    np.testing.assert_allclose(model.state_scale.mean, frame.seen(starts, starts).mean(axis=0), atol=2e-2)
     windows = jnp.stack([obs[:, t : t + 6] for t in range(TICKS - 5)], axis=1).reshape(-1, 6, 27)
+    seen = frame.seen(windows, windows[:, :1])
+    np.testing.assert_allclose(model.state_scale.mean, seen.mean(axis=(0, 1)), atol=2e-2)
     changes = jax.vmap(frame.changes)(windows)[:, -1]
     np.testing.assert_allclose(model.change_scale.std[-2:], changes.std(axis=0)[-2:] / 2, rtol=0.05)
     np.testing.assert_allclose(model.change_scale.std[13:27], changes.std(axis=0)[13:27], rtol=0.05)
-    far = starts[:1].at[0, 13].set(1e3)
+    far = windows[0, :1].at[0, 13].set(1e3)
     assert model.see(far, far).max() == 5.0, "what is seen is clipped"
 
 

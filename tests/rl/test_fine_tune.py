@@ -8,11 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from probes import NO, Probe, assert_trees_equal, numbers
+from sled import Sled
 from tiny_runs import CONFIG, KilledError, assert_same_arrays, die, last_state, tiny_steps, with_fields
 
 from taic_jax.artifacts.models import load_options
 from taic_jax.config import FineTuneConfig, OptionsConfig, PPOConfig
-from taic_jax.envs import make_env
+from taic_jax.envs import Env, TimeLimit, make_env
 from taic_jax.options.execution import OptionExecutor, make_executor
 from taic_jax.options.model import OptionModel, Scale, init_params, make_networks
 from taic_jax.pipeline import run_pipeline
@@ -39,23 +40,26 @@ class Forward(Probe):
         return 0.9 * x + 0.1 * action, action, NO, NO
 
 
-def make(decoder: str) -> OptionExecutor:
+FORWARD = Forward()
+
+
+def make(decoder: str, env: Env = FORWARD, **fields: str) -> OptionExecutor:
     """Return the executor of a model as it is before it learns."""
-    options = dataclasses.replace(OPTIONS, decoder=decoder)
-    networks = make_networks(options, 1, 1)
+    options = dataclasses.replace(OPTIONS, decoder=decoder, **fields)
+    networks = make_networks(options, env.proprioceptive_size, env.action_size, heading=env.heading)
     params = init_params(networks, options, jax.random.key(3))
-    scale = Scale(jnp.zeros(1), jnp.ones(1))
+    scale = Scale(jnp.zeros(env.proprioceptive_size), jnp.ones(env.proprioceptive_size))
     return make_executor(options, OptionModel(params, scale, scale, jnp.ones(()), networks))
 
 
-@partial(jax.jit, static_argnames="count")
-def tune(fine, executor: OptionExecutor, count: int):
+@partial(jax.jit, static_argnames=("count", "env"))
+def tune(fine, executor: OptionExecutor, count: int, env: Env = FORWARD):
     """Return the state and D before and after `count` iterations of D, and the metrics."""
-    state = ppo.init(PPO, Forward(), executor, jax.random.key(0))
+    state = ppo.init(PPO, env, executor, jax.random.key(0))
     before = state, fine_tune.init(PPO, executor)
 
     def one(carry, _):
-        state, tuned, metrics = fine_tune.iterate(PPO, fine, Forward(), executor, ITERATIONS, *carry)
+        state, tuned, metrics = fine_tune.iterate(PPO, fine, env, executor, ITERATIONS, *carry)
         return (state, tuned), metrics
 
     after, metrics = jax.lax.scan(one, before, None, count)
@@ -82,19 +86,21 @@ def test_changes_d_and_nothing_else(decoder):
     assert (layers[0][head]["kernel"][:, 0] != layers[1][head]["kernel"][:, 0]).any()
 
 
-@pytest.mark.parametrize("decoder", ["open", "closed"])
-def test_likelihoods_are_of_the_actions_that_were_taken(decoder):
+@pytest.mark.parametrize(("decoder", "frame", "env"), [
+    ("open", "world", FORWARD), ("closed", "world", FORWARD), ("closed", "heading", TimeLimit(Sled(), 50)),
+])  # fmt: skip
+def test_likelihoods_are_of_the_actions_that_were_taken(decoder, frame, env):
     """The rows hold the actions that the executor emitted, before they were clipped."""
-    executor = make(decoder)
+    executor = make(decoder, env, frame=frame)
     # After an iteration, whose last options go on in the next.
-    state = tune(dataclasses.replace(FINE, learning_rate=jnp.zeros(())), executor, 1)[1][0]
+    state = tune(dataclasses.replace(FINE, learning_rate=jnp.zeros(())), executor, 1, env)[1][0]
     noisy = executor.replace(std=FINE.std)
-    _, _, ticks, judgement = jax.jit(lambda state: ppo.iterate(PPO, Forward(), noisy, ITERATIONS, state))(state)
-    rows = fine_tune._rows(PPO, noisy, state.running.option.option, ticks, judgement)
-    np.testing.assert_allclose(np.clip(rows.action, -1, 1), ticks.action.reshape(-1, 1), atol=1e-5)
+    _, _, ticks, judgement = jax.jit(lambda state: ppo.iterate(PPO, env, noisy, ITERATIONS, state))(state)
+    rows = fine_tune._rows(PPO, noisy, state.running.option, ticks, judgement)
+    np.testing.assert_allclose(np.clip(rows.action, -1, 1), ticks.action.reshape(-1, env.action_size), atol=1e-5)
     assert rows.tick.min() == 0 and rows.tick.max() == L - 1
     # One standard deviation away the likelihood is exp(-1/2) of the highest.
-    np.testing.assert_allclose(np.mean(rows.log_prob), -0.5, atol=0.2)
+    np.testing.assert_allclose(np.mean(rows.log_prob), -0.5 * env.action_size, atol=0.2)
 
 
 def test_the_divergence_is_the_mean_over_rows_of_that_of_all_actions():

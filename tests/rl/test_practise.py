@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from probes import assert_trees_equal, numbers, random_model
 from scipy import special, stats
-from sled import Sled
+from sled import TURN, Sled, turned
 from tiny_runs import (
     CONFIG,
     KilledError,
@@ -98,10 +98,9 @@ def test_the_observation_is_the_input_of_d(task, model, walk):
     params, executor = practise.actor_of(model.params["decoder"], params), make_executor(OPTIONS, model)
     practice = walk[2].physics
     for t, b in ((0, 0), (5, 1), (50, 2), (77, 7)):
-        state = practice.inner.obs[t, b]
-        carry = executor.start(practice.code[t, b], state)
+        carry = executor.start(practice.code[t, b], practice.first[t, b])
         for _ in range(int(practice.tick[t, b]) + 1):
-            carry, action = executor.act(carry, state, jnp.zeros(0))
+            carry, action = executor.act(carry, practice.inner.obs[t, b], jnp.zeros(0))
         np.testing.assert_allclose(policy.mode(params, practice.obs[t, b]), action, atol=1e-5)
         np.testing.assert_array_equal(practice.obs[t, b], walk[2].obs[t, b])
 
@@ -126,14 +125,15 @@ def test_the_reward_is_of_the_speed_in_the_codes_direction(model, walk):
     directions = jax.vmap(jax.vmap(partial(practise.direction, model, sector)))(before.code)
     np.testing.assert_allclose(directions, before.direction, atol=1e-5)
     np.testing.assert_allclose(np.linalg.norm(directions, axis=-1), 1.0, atol=1e-5)
-    along = jnp.sum(actions * directions, axis=-1)  # the sled's own frame is the heading's
-    across = jnp.abs(actions[..., 0] * directions[..., 1] - actions[..., 1] * directions[..., 0])
+    velocity = turned(actions, TURN * before.tick.astype(float))  # seen from where the option began
+    along = jnp.sum(velocity * directions, axis=-1)
+    across = jnp.abs(velocity[..., 0] * directions[..., 1] - velocity[..., 1] * directions[..., 0])
     expected = jnp.minimum(along, 0.8) - 0.5 * across + 1.0 - 0.1 * jnp.sum(actions**2, axis=-1)
     np.testing.assert_allclose(states.reward, expected, atol=1e-4)
 
 
 def test_the_information_of_a_code_is_paid_at_an_options_end(model, walk):
-    """From the likelihoods of 32 other codes; the sled's way is half a second of each action, in its own frame."""
+    """From the likelihoods of 32 other codes; the sled's way is half a second of each action."""
     actions, _, states = walked(Practising(SLED, OPTIONS, dataclasses.replace(PRACTICE, reward="information"), model))
     paid = states.reward - (1.0 - 0.1 * jnp.sum(actions**2, axis=-1))
     others, scale = jax.random.normal(jax.random.key(1), (32, 2)), model.change_scale
@@ -145,7 +145,8 @@ def test_the_information_of_a_code_is_paid_at_an_options_end(model, walk):
                 assert t < L or abs(float(paid[t, b])) < 1e-4
                 continue
             first = practice.inner.obs[t - L, b]
-            way = (0.5 * actions[t - L + 1 : t + 1, b].sum(axis=0) - scale.mean[-2:]) / scale.std[-2:]
+            ways = turned(0.5 * actions[t - L + 1 : t + 1, b], TURN * jnp.arange(float(L)))
+            way = (ways.sum(axis=0) - scale.mean[-2:]) / scale.std[-2:]
             codes = jnp.vstack([practice.code[t - 1, b][None], others])
             ways = jnp.stack([model.predict(model.see(first, first), code)[-2:] for code in codes])
             nats = -0.5 * np.sum(np.square(np.asarray(ways - way[None], np.float64)), axis=1)
