@@ -10,11 +10,13 @@ import pytest
 
 from taic_jax.config import OptionsConfig
 from taic_jax.envs import make_env
-from taic_jax.options.dataset import Experience
+from taic_jax.options.dataset import Experience, Window
 from taic_jax.options.execution import make_executor
 from taic_jax.options.frame import Frame, make_frame
-from taic_jax.options.learning import learn
+from taic_jax.options.learning import learn, window_losses
+from taic_jax.options.losses import reconstruction_loss
 from taic_jax.options.termination import prefix_errors
+from taic_jax.rl.refresh import action_change
 from taic_jax.types import as_arrays
 
 CONFIG = OptionsConfig(
@@ -127,6 +129,20 @@ def test_the_model_acts_and_predicts_alike_after_a_turn(walks, model):
     predicted = jax.vmap(lambda s: model.predict(model.see(s, s), option))(obs[:, 0])
     assert predicted.shape == (4, 29)
     np.testing.assert_allclose(predicted[1:], np.broadcast_to(predicted[0], predicted[1:].shape), atol=1e-4)
+
+
+def test_d_learns_from_what_it_sees_when_it_acts(walks, model):
+    """In stage learn, and when a refresh holds its actions: from the heading of the window's first state."""
+    _, _, actions, obs, _ = walks
+    window, noise = Window(obs[1, 3:9], actions[3:8], jnp.ones(5, bool)), jnp.array([0.3, -0.6])
+    means, log_stds = model.encode(window.actions)
+    option, seen = means[-1] + jnp.exp(log_stds[-1]) * noise, jax.vmap(lambda s: model.see(s, obs[1, 3]))(obs[1, 3:8])
+    other = model.with_decoder(jax.tree.map(lambda x: 0.5 * x, model.params["decoder"]))
+    decoded, halved = (m.decode(option, seen)[0] for m in (model, other))
+    loss = window_losses(model, CONFIG, window, noise)["reconstruction_loss"]
+    np.testing.assert_allclose(loss, reconstruction_loss(decoded, window.actions, window.mask), rtol=1e-5)
+    change = action_change(model, other, window, option)
+    np.testing.assert_allclose(change, reconstruction_loss(halved, decoded, window.mask), rtol=1e-5)
 
 
 def test_scales_are_of_what_is_seen_and_the_way_counts_by_its_weight(walks, model):
