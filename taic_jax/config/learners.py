@@ -146,7 +146,7 @@ class PractiseConfig:
     """Weight of |action|^2 in the reward."""
     kl_weight: float = 0.0
     """Weight of half the squared change of D's actions since it was learnt: a KL divergence under noise of 1."""
-    upright: float = 1.0
+    upright: float = 0.5
     """Weight of the upward part of the torso's own axis in the reward."""
     refit_steps: int = 1000
     """Gradient steps at the end that refit E, P and F to D."""
