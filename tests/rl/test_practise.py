@@ -47,7 +47,7 @@ OPTIONS = as_arrays(OptionsConfig(
     squash=True, frame="heading", way_weight=2, learning_rate=3e-3,
 ))  # fmt: skip
 PRACTICE = PractiseConfig(
-    ticks=30_000, hold=HOLD, speed=0.8, refit_steps=300,
+    ticks=30_000, hold=HOLD, speed=0.8, upright=0.7, refit_steps=300,
     sac=SACConfig(rollout_length=32, update_every=8, updates_per_decision=0.25, batch_size=64, warmup=0,
                   temperature=0.1, learning_rate=1e-3),
 )  # fmt: skip
@@ -128,14 +128,14 @@ def test_the_reward_is_of_the_speed_in_the_codes_direction(model, walk):
     velocity = turned(actions, TURN * before.tick.astype(float))  # seen from where the option began
     along = jnp.sum(velocity * directions, axis=-1)
     across = jnp.abs(velocity[..., 0] * directions[..., 1] - velocity[..., 1] * directions[..., 0])
-    expected = jnp.minimum(along, 0.8) - 0.5 * across + 1.0 - 0.1 * jnp.sum(actions**2, axis=-1)
+    expected = jnp.minimum(along, 0.8) - 0.5 * across + 0.7 - 0.1 * jnp.sum(actions**2, axis=-1)
     np.testing.assert_allclose(states.reward, expected, atol=1e-4)
 
 
 def test_the_information_of_a_code_is_paid_at_an_options_end(model, walk):
     """From the likelihoods of 32 other codes; the sled's way is half a second of each action."""
     actions, _, states = walked(Practising(SLED, OPTIONS, dataclasses.replace(PRACTICE, reward="information"), model))
-    paid = states.reward - (1.0 - 0.1 * jnp.sum(actions**2, axis=-1))
+    paid = states.reward - (0.7 - 0.1 * jnp.sum(actions**2, axis=-1))
     others, scale = jax.random.normal(jax.random.key(1), (32, 2)), model.change_scale
     practice, count = states.physics, 0
     for b in range(8):
