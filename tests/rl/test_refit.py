@@ -41,7 +41,7 @@ def test_every_view_is_as_likely(executor):
 def compare(_loss, _options, model, state, windows, codes):
     """Take no gradient step, and return how far the windows' actions are from those of D in their states."""
     states = windows.states[:, :-1]
-    decoded = jax.vmap(lambda code, seen: model.decode(code, model.see(seen, seen))[0])(codes, states)
+    decoded = jax.vmap(lambda code, seen: model.decode(code, model.see(seen, seen[:1]))[0])(codes, states)
     return state, {"error": jnp.max(jnp.abs(jnp.clip(decoded, -1.0, 1.0) - windows.actions))}
 
 
