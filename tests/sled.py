@@ -8,7 +8,6 @@ from probes import NO
 from taic_jax.envs import Env, State
 from taic_jax.envs.base import Heading
 
-NONE = jnp.zeros(())
 TURN = 0.2  # rad to the left in each tick
 
 
@@ -38,7 +37,7 @@ class Sled(Env):
         yaw = 2.0 * jnp.arctan2(state.obs[3], state.obs[0])
         half = (yaw + TURN) / 2.0
         velocity = turned(action, yaw)
-        obs = jnp.stack([jnp.cos(half), NONE, NONE, jnp.sin(half), *velocity])
+        obs = state.obs.at[0].set(jnp.cos(half)).at[3].set(jnp.sin(half)).at[4:].set(velocity)
         return state.replace(physics=obs, obs=obs, terminated=NO, truncated=NO)
 
     def render(self, physics, *, height=240, width=320):
