@@ -18,6 +18,8 @@ from taic_jax.envs.robots import ANT_BIT
 ANT_QPOS, ANT_QVEL = 15, 14  # the ant's share of qpos and qvel; a block's follows
 SOLID_HEIGHT = 4.0  # m
 TOLERANCE = 0.05  # m, by which a block may overrun its soft limits
+MASS = 0.1  # kg of whatever the ant pushes; HIRO's 0.2 and 1 g go through walls at a steady push
+FENCE = 2.0  # m from the ant at its start
 
 # Bits of contype and conaffinity for pairs that may collide. The ant collides with everything but itself, a block with
 # the solids that its arena names; elsewhere its joint limits stop it, and contacts would make it jam.
@@ -45,9 +47,9 @@ class Block:
     slides: tuple[Slide, ...]
     meets: tuple[int, ...]  # solids in its way
     half: tuple[float, float, float] = (3.96, 3.96, 2.0)  # m; a block as wide as its corridor would jam
-    mass: float = 0.1  # kg; HIRO's 0.2 and 1 g go through walls at a steady push
 
 
+Point = tuple[float, float, float]
 Box = tuple[float, float, float, float]  # x_low, y_low, x_high, y_high
 
 
@@ -86,6 +88,7 @@ PUSH = Arena(
     ),
     block=Block(centre=(0.0, 8.0, 2.0), slides=(_ALONG_X, _ALONG_Y), meets=(0, 1, 2)),
 )
+_FREE_X, _FREE_Y = (dataclasses.replace(slide, limits=(-2000.0, 2000.0)) for slide in (_ALONG_X, _ALONG_Y))
 # The block of the fall may rise a little: a limit at 0 would press it against the platform. Its fall is not damped.
 _DOWN = Slide((0.0, 0.0, 1.0), (-4.0, 0.1), 0.0)
 FALL = Arena(
@@ -114,7 +117,8 @@ def furnish(spec: mujoco.MjSpec, arena: Arena) -> None:
         shape = {"type": _GEOM.mjGEOM_BOX, "pos": pos, "size": half, "rgba": _WALL}
         spec.worldbody.add_geom(name=f"solid_{i}", **shape, contype=0, conaffinity=meets)
     if arena.block:
-        _add_block(spec, arena.block)
+        block = arena.block
+        _add_movable(spec, "block", block.centre, block.slides, [((0.0, 0.0, 0.0), block.half)])
     goal = (*arena.goal, arena.ground + 0.5)[:3]
     spec.worldbody.add_site(name="goal", pos=goal, size=[0.5] * 3, rgba=_GOAL)
     spec.body("torso").pos[2] += arena.ground
@@ -171,15 +175,27 @@ def _add_walls(spec: mujoco.MjSpec, arena: Arena) -> None:
         wall.alt.xyaxes = (0, 0, 1, inward[1], -inward[0], 0)
 
 
-def _add_block(spec: mujoco.MjSpec, block: Block) -> None:
-    body = spec.worldbody.add_body(name="block", pos=block.centre)
-    for i, slide in enumerate(block.slides):
+def enclose(spec: mujoco.MjSpec) -> None:
+    """Put a light fence around the ant, which it pushes along wherever it goes."""
+    away, thin, wide, high = FENCE + 0.25, 0.25, FENCE + 0.5, SOLID_HEIGHT / 2
+    sides = [((x, 0.0, 0.0), (thin, wide, high)) for x in (away, -away)]
+    sides += [((0.0, y, 0.0), (wide, thin, high)) for y in (away, -away)]
+    _add_movable(spec, "fence", (0.0, 0.0, high), (_FREE_X, _FREE_Y), sides)
+
+
+def _add_movable(
+    spec: mujoco.MjSpec, name: str, centre: Point, slides: Sequence[Slide], boxes: Sequence[tuple[Point, Point]]
+) -> None:
+    """Add a body of boxes, each given by its centre from the body's and its half sizes."""
+    body = spec.worldbody.add_body(name=name, pos=centre)
+    for i, slide in enumerate(slides):
         body.add_joint(
-            name=f"block_{i}", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=slide.axis, armature=0,
+            name=f"{name}_{i}", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=slide.axis, armature=0,
             limited=mujoco.mjtLimited.mjLIMITED_TRUE, range=slide.limits, damping=[slide.damping, 0, 0],
         )  # fmt: skip
-    shape = {"type": _GEOM.mjGEOM_BOX, "size": block.half, "mass": block.mass, "rgba": _MOVABLE}
-    body.add_geom(name="block", **shape, contype=_BLOCK, conaffinity=ANT_BIT)
+    for i, (pos, half) in enumerate(boxes):
+        shape = {"type": _GEOM.mjGEOM_BOX, "pos": pos, "size": half, "mass": MASS / len(boxes), "rgba": _MOVABLE}
+        body.add_geom(name=f"{name}_{i}", **shape, contype=_BLOCK, conaffinity=ANT_BIT)
 
 
 def _add_camera(spec: mujoco.MjSpec, arena: Arena) -> None:

@@ -5,18 +5,20 @@ import math
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, Key
 
 from taic_jax.envs.ant_tasks import clear_of_the_floor, heading, turned, unit, upright, upside_down
-from taic_jax.envs.arenas import ANT_QPOS, ANT_QVEL
+from taic_jax.envs.arenas import ANT_QPOS, ANT_QVEL, enclose
 from taic_jax.envs.base import PhysicsState, State
 from taic_jax.envs.locomotion import Locomotion, Outcome
-from taic_jax.envs.robots import ROBOTS, Robot, with_body, with_contacts
+from taic_jax.envs.robots import ROBOTS, Robot, compile_spec, load_spec, with_body, with_contacts
 
 HOLD = 60  # ticks of one direction
 SPREAD = math.pi / 4  # rad, greatest angle of an ant's direction to the x axis: the body's views cover the rest
+FAR = 1000.0  # m; ants do not get there
 
 
 class HeadingsState(PhysicsState):
@@ -81,7 +83,8 @@ class AntHeadings(Headings):
 
     The direction is within 45 degrees of the x axis, and is drawn anew every three seconds. The reward of a tick is the
     speed in m/s along it, less half the speed across it and the control cost, plus the upward part of the torso's own
-    axis: 1 if it is level. Only an ant on its back ends the episode.
+    axis: 1 if it is level. Only an ant on its back ends the episode. In half of the episodes a light fence stands
+    around the ant, which it pushes along: who has met nothing falls over the first block.
 
     Observation: the 27 entries of `ant`; then, seen from the ant's heading, the direction [2] and the torso's
     horizontal velocity [2].
@@ -93,6 +96,22 @@ class AntHeadings(Headings):
         super().__init__("ant_headings", robot, backend, num_threads)
         self.proprioceptive_size = ANT_QPOS - robot.num_unobserved + ANT_QVEL
 
+    def reset(self, key: Key[Array, ""]) -> State:
+        """Start as every robot that is given directions; the fence is far away in half of the episodes."""
+        key, key_fence = jax.random.split(key)
+        state = super().reset(key)
+        away = jnp.where(jax.random.bernoulli(key_fence), FAR, 0.0)
+        return state.replace(physics=state.physics.replace(qpos=state.physics.qpos.at[ANT_QPOS:].set(away)))
+
+    def _make_model(self) -> mujoco.MjModel:
+        spec = load_spec(self.robot)
+        enclose(spec)
+        return compile_spec(spec)
+
+    def _begin(self, physics: PhysicsState) -> HeadingsState:
+        """Take the noise from the fence."""
+        return super()._begin(physics.replace(qvel=physics.qvel.at[ANT_QVEL:].set(0.0)))
+
     def _draw(self, key: Key[Array, ""]) -> Float[Array, " N"]:
         return jax.random.uniform(key, (self._num_directions,), minval=-SPREAD, maxval=SPREAD)
 
@@ -102,7 +121,7 @@ class AntHeadings(Headings):
     def _observe(self, physics: HeadingsState) -> Float[Array, " S"]:
         angle, yaw = self._direction(physics), heading(physics.qpos[3:7])
         seen = turned(jnp.stack([unit(angle), physics.qvel[:2]]), -yaw)
-        return jnp.concatenate([super()._observe(physics), *seen])
+        return jnp.concatenate([physics.qpos[2:ANT_QPOS], physics.qvel[:ANT_QVEL], *seen])
 
     def _is_healthy(self, physics: PhysicsState) -> Bool[Array, ""]:
         return ~upside_down(physics.qpos[3:7])

@@ -146,8 +146,8 @@ class PractiseConfig:
     """Weight of |action|^2 in the reward."""
     kl_weight: float = 0.0
     """Weight of half the squared change of D's actions since it was learnt: a KL divergence under noise of 1."""
-    upright: float = 0.5
-    """Weight of the upward part of the torso's own axis in the reward."""
+    upright: float = 1.0
+    """Weight in the reward of the upward part of the torso's own axis; half of it at first, all from half-time on."""
     refit_steps: int = 1000
     """Gradient steps at the end that refit E, P and F to D."""
     # Hidden layers are those of D.

@@ -38,16 +38,18 @@ class PracticeState(struct.PyTreeNode):
     view: Array  # [] int32, in which D sees the state and acts; 0 without options by their way
     left: Array  # [] int32, options for which the code is still held
     tick: Array  # [] int32, within the option
+    age: Array  # [] int32, ticks since practice began
     key: Array
 
 
 class Practising(Wrapper):
     """A task whose observation is D's input: the state that D sees, a code from the prior, and the share of its ticks.
 
-    The reward of a tick is the upward part of the body's own axis, less the costs of control and of change; and the
-    speed in m/s in the code's direction, up to `speed`, less half the speed across it, or at an option's end the
-    information. Directions are seen from the heading in which the option began. Episodes end as those of the inner
-    task, which resets itself: what resets a batch under `vmap` may not read a model of its own in each row.
+    The reward of a tick is the upward part of the body's own axis, weighed half at first and in full from half of
+    practice on, less the costs of control and of change; and the speed in m/s in the code's direction, up to `speed`,
+    less half the speed across it, or at an option's end the information. Directions are seen from the heading in which
+    the option began. Episodes end as those of the inner task, which resets itself: what resets a batch under `vmap`
+    may not read a model of its own in each row.
     """
 
     def __init__(self, env: Env, options: OptionsConfig, config: PractiseConfig, model: OptionModel):
@@ -60,11 +62,11 @@ class Practising(Wrapper):
     def reset(self, key: Key[Array, ""]) -> State:
         """Start the inner task, and draw a code."""
         key_inner, key = jax.random.split(key)
-        zero, nothing = jnp.zeros((), jnp.int32), jnp.zeros(self.options.size)
+        zero, nothing, still = jnp.zeros((), jnp.int32), jnp.zeros(self.options.size), jnp.zeros(2)
         inner = self.env.reset(key_inner)
         obs, sector = jnp.zeros(self.observation_size), sector_of(self.model)
         first = inner.obs[: self.model.state_size]
-        start = PracticeState(inner, obs, nothing, jnp.zeros(2), first, jnp.zeros(2), sector, zero, zero, zero, key)
+        start = PracticeState(inner, obs, nothing, still, first, still, sector, zero, zero, zero, zero, key)
         practice = self._draw(start)
         return State.first(practice, practice.obs, dict.fromkeys(METRICS, jnp.zeros(())))
 
@@ -84,6 +86,7 @@ class Practising(Wrapper):
         practice = before.replace(
             inner=inner,
             tick=jnp.where(ended, 0, tick),
+            age=before.age + 1,
             left=before.left - ended.astype(jnp.int32),
             first=jnp.where(ended, after, before.first),
             way=jnp.where(ended, 0.0, way),
@@ -129,7 +132,8 @@ class Practising(Wrapper):
         upright = 1 - 2 * (state[at + 1] ** 2 + state[at + 2] ** 2)
         inputs = before.code, model.see(self._state(before, before.inner.obs), first), before.tick, length
         as_learnt = apply(model.networks.decoder, model.params["decoder"], *inputs, method="at")
-        reward = config.upright * upright - config.control_cost * jnp.sum(action**2)
+        grown = jnp.minimum(1.0, 0.5 + before.age.astype(jnp.float32) * config.sac.num_envs / config.ticks)
+        reward = config.upright * grown * upright - config.control_cost * jnp.sum(action**2)
         reward -= 0.5 * config.kl_weight * jnp.sum(jnp.square(action - as_learnt))
         if config.reward == "direction":
             reward += jnp.minimum(along, config.speed) - 0.5 * across

@@ -7,7 +7,8 @@ import pytest
 
 from taic_jax.envs import UnknownNameError, make_env
 from taic_jax.envs.ant_tasks import heading, turned, unit
-from taic_jax.envs.headings import HOLD, SPREAD
+from taic_jax.envs.arenas import FENCE
+from taic_jax.envs.headings import FAR, HOLD, SPREAD
 
 KEYS = jax.random.split(jax.random.key(0), 16)
 
@@ -68,6 +69,17 @@ def test_direction_and_velocity_are_seen_from_the_heading(walk):
         np.testing.assert_allclose(obs[29:], [3, 0], atol=1e-5)
 
 
+def test_a_fence_goes_with_the_ant_in_half_of_the_episodes(walk):
+    """Without one it is out of reach; torsos stay inside, whose legs keep them off the sides."""
+    _, _, first, states = walk
+    fenced, fence = np.asarray(first.physics.qpos[:, 15]) == 0.0, states.physics.qpos[..., 15:]
+    assert 4 <= fenced.sum() <= 12
+    aside = np.abs(states.physics.qpos[..., :2] - fence)
+    assert aside[:, fenced].max() < FENCE < np.abs(states.physics.qpos[:, fenced, :2]).max() + 1.0
+    assert np.abs(fence[-1, fenced]).max() > 0.2, "pushed"
+    np.testing.assert_array_equal(fence[:, ~fenced], FAR)
+
+
 def test_the_cheetah_is_paid_for_going_forward_or_backward_as_it_is_told():
     """Its reward is half_cheetah's, with the sign of the speed that the observation's last entry has."""
     env, plain = make_env("half_cheetah_headings", "mujoco"), make_env("half_cheetah", "mujoco")
@@ -95,7 +107,8 @@ def test_the_body_on_open_ground_moves_as_in_the_arenas():
         env = make_env(name, "mujoco", **options)
         state, step = jax.jit(env.reset)(KEYS[0]), jax.jit(env.step)
         qpos = low.physics.qpos.at[2].set(0.3).at[7:].set(0.0)  # the belly touches the ground
-        state = state.replace(physics=state.physics.replace(qpos=qpos, qvel=low.physics.qvel))
+        qpos, qvel = state.physics.qpos.at[:15].set(qpos), state.physics.qvel.at[:14].set(low.physics.qvel)
+        state = state.replace(physics=state.physics.replace(qpos=qpos, qvel=qvel))
         for action in actions:
             state = step(state, action)
         places[name, bool(options)] = np.asarray(state.physics.qpos[:3])

@@ -51,6 +51,8 @@ PRACTICE = PractiseConfig(
     sac=SACConfig(rollout_length=32, update_every=8, updates_per_decision=0.25, batch_size=64, warmup=0,
                   temperature=0.1, learning_rate=1e-3),
 )  # fmt: skip
+SHORT = dataclasses.replace(PRACTICE, ticks=160 * PRACTICE.sac.num_envs)
+WEIGHTS = 0.7 * jnp.minimum(1.0, 0.5 + jnp.arange(120.0) / 160)[:, None]  # on being upright, tick by tick
 SLED = TimeLimit(Sled(), 50)
 
 
@@ -65,7 +67,7 @@ def model():
 
 @pytest.fixture(scope="module")
 def task(model):
-    return Practising(SLED, OPTIONS, PRACTICE, model)
+    return Practising(SLED, OPTIONS, SHORT, model)
 
 
 @pytest.fixture(scope="module")
@@ -121,28 +123,26 @@ def test_d_becomes_the_actor_and_the_actor_d(task, model):
 def test_the_reward_is_of_the_speed_in_the_codes_direction(model, walk):
     actions, first, states = walk
     before = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b[:-1]]), first.physics, states.physics)
-    sector = practise.sector_of(model)
-    directions = jax.vmap(jax.vmap(partial(practise.direction, model, sector)))(before.code)
+    directions = jax.vmap(jax.vmap(partial(practise.direction, model, practise.sector_of(model))))(before.code)
     np.testing.assert_allclose(directions, before.direction, atol=1e-5)
     np.testing.assert_allclose(np.linalg.norm(directions, axis=-1), 1.0, atol=1e-5)
     velocity = turned(actions, TURN * before.tick.astype(float))  # seen from where the option began
     along = jnp.sum(velocity * directions, axis=-1)
     across = jnp.abs(velocity[..., 0] * directions[..., 1] - velocity[..., 1] * directions[..., 0])
-    expected = jnp.minimum(along, 0.8) - 0.5 * across + 0.7 - 0.1 * jnp.sum(actions**2, axis=-1)
+    expected = jnp.minimum(along, 0.8) - 0.5 * across + WEIGHTS - 0.1 * jnp.sum(actions**2, axis=-1)
     np.testing.assert_allclose(states.reward, expected, atol=1e-4)
 
 
 def test_the_information_of_a_code_is_paid_at_an_options_end(model, walk):
     """From the likelihoods of 32 other codes; the sled's way is half a second of each action."""
-    actions, _, states = walked(Practising(SLED, OPTIONS, dataclasses.replace(PRACTICE, reward="information"), model))
-    paid = states.reward - (0.7 - 0.1 * jnp.sum(actions**2, axis=-1))
+    actions, _, states = walked(Practising(SLED, OPTIONS, dataclasses.replace(SHORT, reward="information"), model))
+    paid = states.reward - (WEIGHTS - 0.1 * jnp.sum(actions**2, axis=-1))
     others, scale = jax.random.normal(jax.random.key(1), (32, 2)), model.change_scale
     practice, count = states.physics, 0
     for b in range(8):
-        for t in range(1, 49):  # within the first episode
-            ended = int(practice.tick[t - 1, b]) + 1 == L
-            if not ended or t < L:
-                assert t < L or abs(float(paid[t, b])) < 1e-4
+        for t in range(L, 49):  # within the first episode
+            if int(practice.tick[t - 1, b]) + 1 != L:
+                assert abs(float(paid[t, b])) < 1e-4
                 continue
             first = practice.inner.obs[t - L, b]
             ways = turned(0.5 * actions[t - L + 1 : t + 1, b], TURN * jnp.arange(float(L)))
@@ -157,7 +157,7 @@ def test_the_information_of_a_code_is_paid_at_an_options_end(model, walk):
 
 
 def test_a_change_of_ds_actions_costs_its_square(task, model, walk):
-    changed = walked(Practising(SLED, OPTIONS, dataclasses.replace(PRACTICE, kl_weight=3.0), model))
+    changed = walked(Practising(SLED, OPTIONS, dataclasses.replace(SHORT, kl_weight=3.0), model))
     policy, params = fresh(task)
     params = practise.actor_of(model.params["decoder"], params)
     actions, first, states = walk
