@@ -18,7 +18,7 @@ from taic_jax.envs.errors import AdapterError
 from taic_jax.envs.physics.mujoco import num_physical_cores
 
 WORDS = 4  # in a seed and in a name, which begins as the seed: numbers below 2^16, which float32 holds exactly
-Rows = Float[np.ndarray, "*batch n"]
+Sent, Returned = Float[np.ndarray, "*batch n"], Float[np.ndarray, "*batch m"]
 
 
 class _Batch(NamedTuple):
@@ -49,7 +49,7 @@ class Episodes:
             raise AdapterError(f"{name}: expected a seed and actions to repeat an episode, got another observation")
         self.metrics = sorted(key for key, value in info.items() if np.ndim(value) == 0 and np.isrealobj(value))
 
-    def start(self, sent: Rows, after: Rows) -> None:
+    def start(self, sent: Sent, after: Returned) -> None:
         """Reset: rows of 1, or 0 to do nothing, the seed, and the name of the episode before; to obs [S]."""
         wanted, seeds, before = np.split(sent.reshape(-1, 1 + 2 * WORDS), [1, 1 + WORDS], axis=1)
 
@@ -58,7 +58,7 @@ class Episodes:
 
         self._each(one, before, np.where(wanted, seeds, before), after, wanted, seeds)
 
-    def step(self, sent: Rows, after: Rows) -> None:
+    def step(self, sent: Sent, after: Returned) -> None:
         """Make a tick: rows of seed, name, obs [S], tick, action [A], and all actions before [T, A]; to name, obs,
         reward, terminated, truncated and metrics."""
         sent, size = sent.reshape(-1, sent.shape[-1]), WORDS + self.obs.size
@@ -98,7 +98,7 @@ class Episodes:
         return np.clip(middle + half * actions, space.low, space.high).astype(space.dtype)
 
     def _each(
-        self, one: Callable[..., None], names: np.ndarray, then: np.ndarray, after: Rows, *rows: np.ndarray
+        self, one: Callable[..., None], names: np.ndarray, then: np.ndarray, after: np.ndarray, *rows: np.ndarray
     ) -> None:  # fmt: skip
         """Call a function on every row with its environment and whether that has the row's name; it gets the next.
 
@@ -111,7 +111,12 @@ class Episodes:
             best = max(range(len(idle)), key=lambda i: ready[i].sum(), default=0)
             known = idle and (ready[best].any() or len(idle) >= 2 * jax.local_device_count())
             batch = idle.pop(best) if known else _Batch([self._make() for _ in names], names)
-        columns = batch.envs, ready[best] if known else [False] * len(names), after.reshape(len(names), -1), *rows
+        columns = (
+            batch.envs,
+            ready[best].tolist() if known else [False] * len(names),
+            after.reshape(len(names), -1),
+            *rows,
+        )
 
         def some(first: int) -> None:
             for row in zip(*(column[first :: self._num_threads] for column in columns), strict=True):
@@ -122,15 +127,16 @@ class Episodes:
 
 
 def following(names: Float[np.ndarray, "N W"], actions: Float[np.ndarray, "N A"]) -> np.ndarray:
-    """Return the names after one more action, by the hash FNV-1a with words in place of bytes."""
+    """Return the names after one more action, by a hash like FNV-1a, of words in place of bytes."""
     state = names.astype(np.uint16).view(np.uint64)[:, 0]
     for column in np.ascontiguousarray(actions).view(np.uint32).T:
         state = (state ^ column) * np.uint64(0x100000001B3)
+        state ^= state >> np.uint64(32)
     return state[:, None].view(np.uint16)
 
 
-def flat(obs: Any) -> Float[np.ndarray, " S"]:
-    """Return an observation as one vector; of one in parts `observation` first, then the others by name."""
+def flat(obs: Any) -> np.ndarray:
+    """Return an observation as one vector [S]; of one in parts `observation` first, then the others by name."""
     if not isinstance(obs, dict):
         return np.ravel(obs)
     return np.concatenate([flat(obs[name]) for name in sorted(obs, key=lambda name: (name != "observation", name))])
