@@ -56,7 +56,7 @@ class Episodes:
         def one(env: Any, _: bool, result: np.ndarray, wanted: np.ndarray, seed: np.ndarray) -> None:
             result[:] = flat(env.reset(seed=as_seed(seed))[0]) if wanted else 0.0
 
-        self._each(one, before, np.where(wanted, seeds, before), after, wanted, seeds)
+        self._each(one, before, wanted != 0, seeds, after, wanted, seeds)
 
     def step(self, sent: Sent, after: Returned) -> None:
         """Make a tick: rows of seed, name, obs [S], tick, action [A], and all actions before [T, A]; to name, obs,
@@ -74,7 +74,7 @@ class Episodes:
             result[WORDS:size] = flat(obs)
             result[size:] = *outcome, *[info.get(key, 0.0) for key in self.metrics]
 
-        self._each(one, names, after[:, :WORDS], after, self._controls(actions), seeds, obs, ticks, past)
+        self._each(one, names, True, after[:, :WORDS], after, self._controls(actions), seeds, obs, ticks, past)
 
     def _repeat(self, env: Any, seed: np.ndarray, obs: np.ndarray, tick: np.ndarray, past: np.ndarray) -> None:
         """Repeat the ticks of an episode, or raise `AdapterError` at another last observation."""
@@ -98,9 +98,10 @@ class Episodes:
         return np.clip(middle + half * actions, space.low, space.high).astype(space.dtype)
 
     def _each(
-        self, one: Callable[..., None], names: np.ndarray, then: np.ndarray, after: np.ndarray, *rows: np.ndarray
+        self, one: Callable[..., None], names: np.ndarray, moved: Any, then: np.ndarray, after: np.ndarray, *rows: Any
     ) -> None:  # fmt: skip
-        """Call a function on every row with its environment and whether that has the row's name; it gets the next.
+        """Call a function on every row with its environment and whether that has the row's name; those moved have the
+        next ones then.
 
         The environments are those that have most of the names. If none has any, a program begins: it gets new ones,
         unless twice as many batches as devices wait, of which it takes the oldest.
@@ -110,7 +111,7 @@ class Episodes:
             ready = [np.all(batch.names == names, axis=1) for batch in idle]
             best = max(range(len(idle)), key=lambda i: ready[i].sum(), default=0)
             known = idle and (ready[best].any() or len(idle) >= 2 * jax.local_device_count())
-            batch = idle.pop(best) if known else _Batch([self._make() for _ in names], names)
+            batch = idle.pop(best) if known else _Batch([self._make() for _ in names], np.full_like(names, -1))
         columns = (
             batch.envs,
             ready[best].tolist() if known else [False] * len(names),
@@ -123,7 +124,7 @@ class Episodes:
                 one(*row)
 
         list(self._threads.map(some, range(self._num_threads)))
-        idle.append(_Batch(batch.envs, then.copy()))
+        idle.append(_Batch(batch.envs, np.where(moved, then, batch.names)))
 
 
 def following(names: Float[np.ndarray, "N W"], actions: Float[np.ndarray, "N A"]) -> np.ndarray:

@@ -153,6 +153,8 @@ def test_a_state_can_be_stepped_again_with_and_without_its_environment():
     one = step(states, action)
     assert (step(states, -action).physics.name != one.physics.name).any(axis=1).all()
     env.env._episodes._idle.clear()
+    skip = jax.random.wrap_key_data(jnp.full((3, 2), 2**32 - 1, jnp.uint32))
+    jax.block_until_ready(jax.vmap(env.restart)(skip.at[0].set(jax.random.key(5)), states.physics))
     for other in (
         step(states, action),
         jax.vmap(jax.vmap(env.step))(*jax.tree.map(lambda x: x[None], (states, action))),
@@ -207,7 +209,9 @@ def test_an_episode_that_does_not_repeat_is_refused():
 
 def test_a_killed_run_resumes_exactly(tmp_path, monkeypatch):
     """After the kill no environment is left, as in a new process."""
-    config = with_fields(CONFIG, env__name="gymnasium:Walk-v0", collect__env="", evaluate__video_ticks=0)
+    config = with_fields(
+        CONFIG, env__name="gymnasium:Walk-v0", collect__env="", evaluate__video_ticks=0, train__baselines=()
+    )
     with tiny_steps():
         run_pipeline(config, tmp_path / "whole", quiet=True)
         with monkeypatch.context() as patch:
