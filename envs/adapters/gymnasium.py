@@ -164,9 +164,11 @@ def _make(name: str, **settings: Any) -> Any:
     spec, gymnasium, name = find_spec(name), importlib.import_module("gymnasium"), GYMNASIUM_PREFIX + name
     before = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(lambda message: None)  # MuJoCo would write MUJOCO_LOG.TXT into the current folder
-    with warnings.catch_warnings(action="ignore"):
-        env: Any = gymnasium.make(spec, max_episode_steps=-1, disable_env_checker=True, **settings)
-    mujoco.set_mju_user_warning(before)
+    try:
+        with warnings.catch_warnings(action="ignore"):
+            env: Any = gymnasium.make(spec, max_episode_steps=-1, disable_env_checker=True, **settings)
+    finally:
+        mujoco.set_mju_user_warning(before)
     require_vector_actions(name, env)
     space = env.observation_space
     if not all(isinstance(part, gymnasium.spaces.Box) for part in getattr(space, "values", lambda: [space])()):

@@ -170,7 +170,8 @@ def test_rows_of_seeds_are_one_call_and_only_ended_episodes_are_reset(monkeypatc
     monkeypatch.setattr(
         host, "_function", lambda sent, after: (sizes.append(sent.shape[:-1]), step(env.env.env._episodes, sent, after))
     )
-    keys, actions = jax.random.split(jax.random.key(0), (2, 3)), jnp.zeros((8, 2, 3, 2))
+    keys = jax.random.split(jax.random.key(0), (2, 3))
+    actions = jnp.broadcast_to(jnp.linspace(-1.0, 1.0, 6).reshape(2, 3, 1), (8, 2, 3, 2))
     step_all, Walk.resets = jax.vmap(jax.vmap(env.step)), 0
     run = jax.jit(
         lambda keys: jax.lax.scan(lambda s, a: (step_all(s, a),) * 2, jax.vmap(jax.vmap(env.reset))(keys), actions)[1]
