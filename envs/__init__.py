@@ -16,6 +16,7 @@ if sys.platform == "linux" and "DISPLAY" not in os.environ and ctypes.util.find_
     os.environ.setdefault("MUJOCO_GL", "egl")
 
 from taic_jax.envs.adapters import BRAX_PREFIX, GYMNAX_PREFIX, PLAYGROUND_PREFIX, BraxEnv, GymnaxEnv, PlaygroundEnv
+from taic_jax.envs.adapters.gymnasium import GYMNASIUM_PREFIX, GymnasiumEnv
 from taic_jax.envs.ant_tasks import AntArena, AntTurn
 from taic_jax.envs.arenas import FALL, MAZE, PUSH
 from taic_jax.envs.base import Env, PhysicsState, State
@@ -75,6 +76,7 @@ _TASKS = {
 _LIBRARIES = {  # prefix -> a task's constructor, which takes the name after it first
     BRAX_PREFIX: _Task(BraxEnv, ("pipeline",), has_engine=False),
     PLAYGROUND_PREFIX: _Task(PlaygroundEnv, has_engine=False),
+    GYMNASIUM_PREFIX: _Task(GymnasiumEnv, has_engine=False),
     GYMNAX_PREFIX: _Task(GymnaxEnv, has_engine=False),
 }
 
@@ -94,8 +96,8 @@ def make_env(name: str, backend: str = "auto", *, num_threads: int = 0, **option
     """Make a task by name, with its time limit.
 
     Args:
-      name: one of `environment_names()`; `brax:NAME`, `playground:NAME` or `gymnax:NAME` for an environment of those
-        packages; `FILE.py:CLASS` or `MODULE:CLASS` for your own.
+      name: one of `environment_names()`; `brax:NAME`, `playground:NAME`, `gymnax:NAME`, `gymnasium:ID` or
+        `gymnasium:MODULE:ID` for an environment of those packages; `FILE.py:CLASS` or `MODULE:CLASS` for your own.
       backend: physics of the MuJoCo tasks, `auto`, `mujoco`, `mjx` or `warp` (see `physics.make_physics`).
       num_threads: threads of the `mujoco` backend; 0 takes one per physical core.
       **options: those of the task (`environment_options`); a default is accepted by every task.

@@ -118,7 +118,8 @@ class Env(abc.ABC):
     def restart(self, key: Key[Array, ""], ended: Any) -> State:
         """Draw the first state of the episode after one that ended in physics `ended`; by default any first state.
 
-        A task that changes from episode to episode overrides this.
+        A task that changes from episode to episode overrides this. Where no episode ended, all bits of the key
+        are ones, and the start is discarded.
         """
         return self.reset(key)
 

@@ -43,7 +43,7 @@ def render_mujoco(
     tile = 2 * model.geom_size[floor, :2] / model.mat_texrepeat[model.geom_matid[floor]] if floor >= 0 else np.zeros(2)
     data = mujoco.MjData(model)
     frames = []
-    with _make_renderer(model, height, width) as renderer:
+    with make_renderer(model, height, width) as renderer:
         for t, pose in enumerate(np.asarray(qpos)):
             data.qpos[:] = pose
             mujoco.mj_forward(model, data)
@@ -56,7 +56,8 @@ def render_mujoco(
     return np.stack(frames)
 
 
-def _make_renderer(model: mujoco.MjModel, height: int, width: int) -> mujoco.Renderer:
+def make_renderer(model: mujoco.MjModel, height: int, width: int) -> mujoco.Renderer:
+    """Return a renderer of a model, or raise `RenderingError` without OpenGL."""
     headless = sys.platform == "linux" and "DISPLAY" not in os.environ
     context = getattr(mujoco, "GLContext", None)  # the kind was chosen when MuJoCo was imported
     # Without a display, GLFW fails, and the second time ends the process: it must not be tried.

@@ -123,7 +123,8 @@ class AutoReset(Wrapper):
         """Replace each state at an episode's end by a fresh start; all arguments have the leading axes of `ended`."""
 
         def restart(ended: Array, key: Array, running: Any) -> Any:
-            start = self.env.restart(key, running[0])
+            blank = jax.random.wrap_key_data(~jnp.zeros_like(jax.random.key_data(key)), impl=jax.random.key_impl(key))
+            start = self.env.restart(jnp.where(ended, key, blank), running[0])
             start = (start.physics, start.obs, start.tick)
             return jax.tree.map(lambda new, old: jnp.where(ended, new, old), start, running)
 

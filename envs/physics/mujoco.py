@@ -15,7 +15,7 @@ from jax import Array
 from jaxtyping import Float
 
 from taic_jax.envs.base import Physics, PhysicsState
-from taic_jax.envs.physics.host_call import HostCall, host_calls_work
+from taic_jax.envs.physics.host_call import HostFunction
 from taic_jax.envs.physics.watchdog import Watchdog
 
 # Contents of a call, in the order of MuJoCo's state rows, where only the time precedes it.
@@ -55,13 +55,7 @@ class MujocoPhysics(Physics):
     def step(self, state: PhysicsState, ctrl: Float[Array, " nu"]) -> PhysicsState:
         nq, nv = self.model.nq, self.model.nv
         sent = jnp.concatenate([state.qpos, state.qvel, state.qacc_warmstart, ctrl])
-        # `pure_callback` serves accelerators and an XLA that refuses our host calls. On CPU it takes ten times as long
-        # to pass arrays as a host call, which steps in XLA's own memory.
-        call, size = self.engine.call, self.engine.num_returned
-        shape = jax.ShapeDtypeStruct((size,), jnp.float32)
-        elsewhere = functools.partial(jax.pure_callback, self.engine.copied_step, shape, vmap_method="broadcast_all")
-        here = elsewhere if call is None else functools.partial(call, size=size)
-        after = jax.lax.platform_dependent(sent, cpu=here, default=elsewhere)
+        after = self.engine.call(sent, self.engine.num_returned)
         return state.replace(qpos=after[:nq], qvel=after[nq : nq + nv], qacc_warmstart=after[nq + nv :])
 
 
@@ -73,7 +67,7 @@ class Engine:
 
     def __init__(self, name: str, model: mujoco.MjModel, substeps: int, num_threads: int):
         self.num_returned = model.nq + 2 * model.nv
-        self.call = HostCall(name, self.step) if host_calls_work() else None
+        self.call = HostFunction(name, self.step)
         self._model, self._substeps, self._num_threads = model, substeps, num_threads
         self._watchdog = Watchdog(PATIENCE, LATE)
         self._idle: dict[int, list[mujoco.batch.Batch]] = {}
@@ -97,12 +91,6 @@ class Engine:
             after[batch.warning[:, _DIVERGED, 1].any(axis=1)] = np.nan
             batch.warning[...] = 0
         idle.append(batch)
-
-    def copied_step(self, sent: Float[Array, "*batch n"]) -> Float[np.ndarray, "*batch m"]:
-        """Return the simulations' states after a tick."""
-        after = np.empty((*sent.shape[:-1], self.num_returned), np.float32)
-        self.step(np.asarray(sent), after)
-        return after
 
 
 @functools.cache
