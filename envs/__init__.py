@@ -4,6 +4,7 @@ if __name__ == "envs":  # would be a second copy of every class
     raise ImportError("this folder is the package `taic_jax.envs`; import it by that name")
 
 import ctypes.util
+import dataclasses
 import os
 import sys
 from collections.abc import Callable
@@ -17,25 +18,33 @@ if sys.platform == "linux" and "DISPLAY" not in os.environ and ctypes.util.find_
 
 from taic_jax.envs.adapters import BRAX_PREFIX, GYMNAX_PREFIX, PLAYGROUND_PREFIX, BraxEnv, GymnaxEnv, PlaygroundEnv
 from taic_jax.envs.adapters.gymnasium import GYMNASIUM_PREFIX, GymnasiumEnv
-from taic_jax.envs.ant_tasks import AntArena, AntTurn
-from taic_jax.envs.arenas import FALL, MAZE, PUSH
+from taic_jax.envs.ant_tasks import AntTurn, ArenaTask
+from taic_jax.envs.arenas import FALL, MAZE, PUSH, Arena
 from taic_jax.envs.base import Env, PhysicsState, State
 from taic_jax.envs.contract import check_contract
 from taic_jax.envs.custom import load_custom
-from taic_jax.envs.errors import ContractError, EnvOptionError, MissingExtraError, RenderingError, UnknownNameError
+from taic_jax.envs.errors import (
+    ContractError,
+    EnvOptionError,
+    MissingExtraError,
+    ModelError,
+    RenderingError,
+    UnknownNameError,
+)
 from taic_jax.envs.grid import FourRooms
-from taic_jax.envs.headings import AntHeadings, CheetahHeadings
+from taic_jax.envs.headings import CheetahHeadings, FreeHeadings
 from taic_jax.envs.locomotion import Locomotion
+from taic_jax.envs.menagerie import MENAGERIE_PREFIX, TICK, legged_robot, menagerie_robot
 from taic_jax.envs.navigation import Navigation
 from taic_jax.envs.physics import BACKENDS
-from taic_jax.envs.robots import ROBOTS, with_body, with_contacts
+from taic_jax.envs.robots import ROBOTS, Robot, with_body, with_contacts
 from taic_jax.envs.wrappers import AutoReset, TimeLimit, Wrapper
 
 __all__ = [
-    "AntArena", "AntHeadings", "AntTurn", "AutoReset", "BraxEnv", "CheetahHeadings", "ContractError", "Env",
-    "EnvOptionError", "FourRooms", "GymnaxEnv", "Locomotion", "MissingExtraError", "Navigation", "PhysicsState",
-    "PlaygroundEnv", "RenderingError", "State", "TimeLimit", "UnknownNameError", "Wrapper", "check_contract",
-    "environment_names", "environment_options", "make_env",
+    "AntTurn", "ArenaTask", "AutoReset", "BraxEnv", "CheetahHeadings", "ContractError", "Env", "EnvOptionError",
+    "FourRooms", "FreeHeadings", "GymnaxEnv", "Locomotion", "MissingExtraError", "ModelError", "Navigation",
+    "PhysicsState", "PlaygroundEnv", "RenderingError", "State", "TimeLimit", "UnknownNameError", "Wrapper",
+    "check_contract", "environment_names", "environment_options", "legged_robot", "make_env", "menagerie_robot",
 ]  # fmt: skip
 
 
@@ -55,6 +64,33 @@ def _make_robot(
     return Locomotion(name, with_contacts(with_body(ROBOTS[model][name], body), contacts), backend, num_threads)
 
 
+def _ant(body: str, **changes: float) -> Robot:
+    """Return the ant with contacts of its whole body."""
+    return with_contacts(with_body(dataclasses.replace(ROBOTS["brax"]["ant"], **changes), body), "body")
+
+
+def _make_ant_headings(body: str, backend: str, num_threads: int) -> Env:
+    return FreeHeadings("ant_headings", _ant(body, control_cost=0.1), backend, num_threads)  # at 0.5 it hardly walks
+
+
+def _make_ant_arena(name: str, arena: Arena, body: str, goal: str, backend: str, num_threads: int) -> Env:
+    return ArenaTask(name, arena, _ant(body), goal, backend, num_threads)
+
+
+def _make_walk(name: str, backend: str, num_threads: int) -> Env:
+    return Locomotion(MENAGERIE_PREFIX + name, menagerie_robot(name), backend, num_threads)
+
+
+def _make_headings(name: str, backend: str, num_threads: int) -> Env:
+    robot, hold = menagerie_robot(name), round(3.0 / TICK)
+    return FreeHeadings(f"{MENAGERIE_PREFIX}{name}_headings", robot, backend, num_threads, hold)
+
+
+def _make_maze(name: str, goal: str, backend: str, num_threads: int) -> Env:
+    robot = dataclasses.replace(menagerie_robot(name), episode_length=round(50.0 / TICK))  # s, as long as the ant's
+    return ArenaTask(f"{MENAGERIE_PREFIX}{name}_maze", MAZE, robot, goal, backend, num_threads)
+
+
 DEFAULTS: dict[str, str | int] = {
     "pipeline": "spring", "model": "brax", "body": "gym", "contacts": "feet", "goal": "fixed", "change_after": 0,
 }  # fmt: skip
@@ -67,17 +103,20 @@ _TASKS = {
     **{name: _Task(partial(_make_robot, name), ("model",)) for name in ROBOTS["brax"]},
     "ant": _Task(partial(_make_robot, "ant"), ("model", "body", "contacts")),  # alone of the robots it has two bodies
     "half_cheetah_headings": _Task(CheetahHeadings),
-    "ant_headings": _Task(AntHeadings, ("body",)),
+    "ant_headings": _Task(_make_ant_headings, ("body",)),
     "ant_turn": _Task(partial(AntTurn, "ant_turn", ROBOTS["brax"]["ant"])),
-    "ant_maze": _Task(partial(AntArena, "ant_maze", MAZE), ("body", "goal")),
-    "ant_push": _Task(partial(AntArena, "ant_push", PUSH), ("body", "goal")),
-    "ant_fall": _Task(partial(AntArena, "ant_fall", FALL), ("body", "goal")),
+    "ant_maze": _Task(partial(_make_ant_arena, "ant_maze", MAZE), ("body", "goal")),
+    "ant_push": _Task(partial(_make_ant_arena, "ant_push", PUSH), ("body", "goal")),
+    "ant_fall": _Task(partial(_make_ant_arena, "ant_fall", FALL), ("body", "goal")),
 }
-_LIBRARIES = {  # prefix -> a task's constructor, which takes the name after it first
-    BRAX_PREFIX: _Task(BraxEnv, ("pipeline",), has_engine=False),
-    PLAYGROUND_PREFIX: _Task(PlaygroundEnv, has_engine=False),
-    GYMNASIUM_PREFIX: _Task(GymnasiumEnv, has_engine=False),
-    GYMNAX_PREFIX: _Task(GymnaxEnv, has_engine=False),
+_LIBRARIES = {  # prefix and ending -> a task's constructor, which takes the name between them first
+    (BRAX_PREFIX, ""): _Task(BraxEnv, ("pipeline",), has_engine=False),
+    (PLAYGROUND_PREFIX, ""): _Task(PlaygroundEnv, has_engine=False),
+    (GYMNASIUM_PREFIX, ""): _Task(GymnasiumEnv, has_engine=False),
+    (GYMNAX_PREFIX, ""): _Task(GymnaxEnv, has_engine=False),
+    (MENAGERIE_PREFIX, "_headings"): _Task(_make_headings),
+    (MENAGERIE_PREFIX, "_maze"): _Task(_make_maze, ("goal",)),
+    (MENAGERIE_PREFIX, ""): _Task(_make_walk),
 }
 
 
@@ -97,7 +136,9 @@ def make_env(name: str, backend: str = "auto", *, num_threads: int = 0, **option
 
     Args:
       name: one of `environment_names()`; `brax:NAME`, `playground:NAME`, `gymnax:NAME`, `gymnasium:ID` or
-        `gymnasium:MODULE:ID` for an environment of those packages; `FILE.py:CLASS` or `MODULE:CLASS` for your own.
+        `gymnasium:MODULE:ID` for an environment of those packages; `menagerie:NAME` for a robot of MuJoCo Menagerie,
+        and `menagerie:NAME_headings` or `menagerie:NAME_maze` for it in the tasks of the ant; `FILE.py:CLASS` or
+        `MODULE:CLASS` for your own.
       backend: physics of the MuJoCo tasks, `auto`, `mujoco`, `mjx` or `warp` (see `physics.make_physics`).
       num_threads: threads of the `mujoco` backend; 0 takes one per physical core.
       **options: those of the task (`environment_options`); a default is accepted by every task.
@@ -114,6 +155,7 @@ def make_env(name: str, backend: str = "auto", *, num_threads: int = 0, **option
       UnknownNameError: there is no such task or value; the message names the nearest.
       EnvOptionError: the task has no such option.
       MissingExtraError: it needs a package that is not installed.
+      ModelError: a robot's model does not fit its task.
       ContractError: an environment from elsewhere breaks the contract of `Env`.
     """
     task = _find(name)
@@ -132,10 +174,10 @@ def make_env(name: str, backend: str = "auto", *, num_threads: int = 0, **option
 def _find(name: str) -> _Task:
     if name in _TASKS:
         return _TASKS[name]
-    for prefix, library in _LIBRARIES.items():
-        if name.startswith(prefix):
-            return library._replace(make=partial(library.make, name.removeprefix(prefix)))
+    for (prefix, ending), library in _LIBRARIES.items():
+        if name.startswith(prefix) and name.endswith(ending):
+            return library._replace(make=partial(library.make, name.removeprefix(prefix).removesuffix(ending)))
     if ":" in name:
         return _Task(partial(load_custom, name))
-    others = (*(f"{prefix}NAME" for prefix in _LIBRARIES), "FILE.py:CLASS")
+    others = (*(f"{prefix}NAME{ending}" for prefix, ending in _LIBRARIES), "FILE.py:CLASS")
     raise UnknownNameError("environment", name, (*_TASKS, *others))

@@ -1,4 +1,4 @@
-"""Tasks of the ant: to go where it should, to turn, and to reach a goal in a maze, behind a block or over a chasm."""
+"""Tasks of robots with a free root: to turn, and to reach a goal in a maze, behind a block or over a chasm."""
 
 import copy
 import dataclasses
@@ -10,16 +10,17 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, Key
 
-from taic_jax.envs.arenas import ANT_QPOS, ANT_QVEL, Arena, furnish, is_open
+from taic_jax.envs.arenas import Arena, furnish, is_open
 from taic_jax.envs.base import Goals, PhysicsState, State
 from taic_jax.envs.errors import UnknownNameError
 from taic_jax.envs.locomotion import Locomotion, Outcome
+from taic_jax.envs.orientation import heading, upside_down, wrapped
 from taic_jax.envs.rendering import render_mujoco
-from taic_jax.envs.robots import ROBOTS, compile_spec, load_spec, with_body, with_contacts
+from taic_jax.envs.robots import Robot
 
 SUCCESS_RADIUS = 5.0  # m, of HIRO
 PATIENCE = 40  # ticks on the back after which an arena cuts an episode of training
-CANDIDATES = 32  # for a place that is drawn, of which the first is taken where an ant can be
+CANDIDATES = 32  # for a place that is drawn, of which the first is taken where a robot can be
 BODY_WIDTH = 1.2  # m from walls at a start that is drawn
 
 
@@ -52,28 +53,28 @@ class ArenaState(PhysicsState):
     on_back: Array  # [] int32, ticks on the back without a break
 
 
-class AntArena(Locomotion):
+class ArenaTask(Locomotion):
     """Reach the goal of an arena: reward = -distance in m at each tick; only the time limit ends the episode.
 
     A fall does not: as every reward is negative, it would pay to fall. A simulation that diverges is truncated, not
-    terminated, in its last finite state; in training so is an ant that lies on its back.
+    terminated, in its last finite state; in training so is a robot that lies on its back.
 
-    Observation: the 27 entries of `ant`, heights from the ground of the start, so that options learnt there apply; then
+    Observation: that of `Locomotion`, heights from the ground of the start, so that options learnt there apply; then
     the position [2], the way to the goal [2 or 3], and the way to a block [3].
 
     Args:
-      body: of the ant, see `with_body`; options learnt on an `ant` of the same body apply.
+      robot: with a free root, and contacts of its body; options learnt with the same robot apply.
       goal: `fixed`; `near`, if the arena has one; or, as in HIRO's maze, `uniform` in training, over all places where
-        an ant can be, and fixed in evaluation; `mixed` draws it in half of the episodes, and the start in half.
+        a robot can be, and fixed in evaluation; `mixed` draws it in half of the episodes, and the start in half.
 
     Raises:
-      UnknownNameError: there is no such body or goal.
+      UnknownNameError: there is no such goal.
     """
 
     staggered = True
 
     def __init__(
-        self, name: str, arena: Arena, body: str, goal: str = "fixed", backend: str = "auto", num_threads: int = 0
+        self, name: str, arena: Arena, robot: Robot, goal: str = "fixed", backend: str = "auto", num_threads: int = 0
     ):
         goals = ("fixed", *(("near",) if arena.near_goal else ()), "uniform", "mixed")
         if goal not in goals:
@@ -82,12 +83,11 @@ class AntArena(Locomotion):
             arena = dataclasses.replace(arena, goal=arena.near_goal)
         self.arena, self.goal = arena, goal
         self.patience: int | None = PATIENCE
-        robot = with_contacts(with_body(ROBOTS["brax"]["ant"], body), "body")
+        self.num_slides = len(arena.block.slides) if arena.block else 0
         super().__init__(name, robot, backend, num_threads)
-        self.proprioceptive_size = ANT_QPOS - robot.num_unobserved + ANT_QVEL
 
     @property
-    def evaluated(self) -> "AntArena":
+    def evaluated(self) -> "ArenaTask":
         """This arena with its fixed goal, and whole episodes."""
         arena = copy.copy(self)
         arena.goal, arena.patience = "fixed", None
@@ -127,7 +127,7 @@ class AntArena(Locomotion):
         return state.replace(physics=physics, obs=self._observe(physics))
 
     def _draw(self, key: Key[Array, ""], width: float = 0.0) -> Float[Array, " 2"]:
-        """Draw a place where an ant can be, or start."""
+        """Draw a place where a robot can be, or start."""
         low, high = jnp.array(self.arena.room).reshape(2, 2)
         places = jax.random.uniform(key, (CANDIDATES, 2), minval=low, maxval=high)
         return places[jnp.argmax(jax.vmap(lambda place: is_open(self.arena, place, width))(places))]
@@ -147,20 +147,18 @@ class AntArena(Locomotion):
             goal = np.concatenate([goal, np.full((len(goal), 1), 0.5, goal.dtype)], axis=1)
         return render_mujoco(self.model, physics.qpos, height=height, width=width, camera="arena", site=goal)
 
-    def _make_model(self) -> mujoco.MjModel:
-        spec = load_spec(self.robot)
-        furnish(spec, self.arena)
-        return compile_spec(spec)
+    def _furnish(self, spec: mujoco.MjSpec) -> None:
+        furnish(spec, self.arena, self.robot.pushes)
 
     def _start(self) -> Float[np.ndarray, " nq"]:
-        return clear_of_the_floor(super()._start(), self.model)
+        return clear_of_the_floor(super()._start(), self.physics.model)
 
     def _begin(self, physics: PhysicsState) -> ArenaState:
         """Take the noise from the block, and start the record of distances."""
-        qpos = jnp.concatenate([physics.qpos[:ANT_QPOS], self._init_qpos[ANT_QPOS:]])
-        qvel = physics.qvel.at[ANT_QVEL:].set(0.0)
+        qpos = jnp.concatenate([physics.qpos[: self.body_nq], self._init_qpos[self.body_nq :]])
+        physics = physics.replace(qpos=qpos, qvel=physics.qvel.at[self.body_nv :].set(0.0))
         goal, closest, on_back = jnp.array(self.arena.goal), jnp.zeros(()), jnp.zeros((), jnp.int32)
-        start = ArenaState(qpos, qvel, physics.qacc_warmstart, goal, closest, on_back)
+        start = ArenaState(**vars(physics), goal=goal, closest=closest, on_back=on_back)
         return start.replace(closest=self._distance(start))
 
     def _advance(self, before: ArenaState, after: ArenaState) -> ArenaState:
@@ -172,8 +170,8 @@ class AntArena(Locomotion):
 
     def _observe(self, physics: ArenaState) -> Float[Array, " S"]:
         torso = physics.qpos[:3]
-        body = physics.qpos[2:ANT_QPOS].at[0].add(-self.arena.ground)
-        entries = [body, physics.qvel[:ANT_QVEL], torso[:2], physics.goal - torso[: physics.goal.shape[0]]]
+        body = physics.qpos[2 : self.body_nq].at[0].add(-self.arena.ground)
+        entries = [body, physics.qvel[: self.body_nv], torso[:2], physics.goal - torso[: physics.goal.shape[0]]]
         if self.arena.block:
             entries.append(self.block_position(physics.qpos) - torso)
         return jnp.concatenate(entries)
@@ -182,7 +180,7 @@ class AntArena(Locomotion):
         """Return the block's centre in m."""
         block = self.arena.block
         axes = jnp.array([slide.axis for slide in block.slides], jnp.float32)
-        return jnp.array(block.centre, jnp.float32) + qpos[ANT_QPOS:] @ axes
+        return jnp.array(block.centre, jnp.float32) + qpos[self.body_nq :] @ axes
 
     def _is_healthy(self, physics: PhysicsState) -> Bool[Array, ""]:
         return jnp.ones((), bool)
@@ -195,42 +193,8 @@ class AntArena(Locomotion):
 
 
 def clear_of_the_floor(qpos: Float[np.ndarray, " n"], model: mujoco.MjModel) -> Float[np.ndarray, " nq"]:
-    """Return an ant's pose at the height of the model's default pose, and whatever else moves in that pose.
+    """Return a robot's pose at the height of the model's default pose, and whatever else moves in that pose.
 
-    At Brax's height of 0.55 m Gym's noise puts legs into the floor, which throws the ant up, and every seventh over.
+    At Brax's height of 0.55 m Gym's noise puts legs into the floor, which throws ants up, and every seventh over.
     """
-    return np.concatenate([qpos[:2], model.qpos0[2:3], qpos[3:ANT_QPOS], model.qpos0[ANT_QPOS:]])
-
-
-def heading(quaternion: Float[Array, " 4"]) -> Float[Array, ""]:
-    """Return the yaw in rad of the body's x axis, projected on the ground."""
-    w, x, y, z = quaternion
-    return jnp.arctan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2))
-
-
-def unit(angle: Float[Array, ""]) -> Float[Array, " 2"]:
-    """Return the vector of length 1 in this direction in rad."""
-    return jnp.stack([jnp.cos(angle), jnp.sin(angle)])
-
-
-def turned(vectors: Float[Array, "*batch 2"], angle: Float[Array, ""]) -> Float[Array, "*batch 2"]:
-    """Return horizontal vectors turned to the left by an angle in rad."""
-    c, s = unit(angle)
-    x, y = vectors[..., 0], vectors[..., 1]
-    return jnp.stack([c * x - s * y, s * x + c * y], axis=-1)
-
-
-def upright(quaternion: Float[Array, " 4"]) -> Float[Array, ""]:
-    """Return the upward part of the body's own z axis: 1 if it is level, and negative on its back."""
-    _, x, y, _ = quaternion
-    return 1 - 2 * (x**2 + y**2)
-
-
-def upside_down(quaternion: Float[Array, " 4"]) -> Bool[Array, ""]:
-    """Return whether the body's own z axis points down."""
-    return upright(quaternion) < 0
-
-
-def wrapped(angle: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """Return the same angle in [-pi, pi)."""
-    return (angle + jnp.pi) % (2 * jnp.pi) - jnp.pi
+    return np.concatenate([qpos[:2], model.qpos0[2:3], qpos[3:], model.qpos0[len(qpos) :]])

@@ -1,4 +1,4 @@
-"""The three arenas of HIRO as data, and the ant's model in one of them.
+"""The three arenas of HIRO as data, and a robot's model in one of them.
 
 Each is a rectangular room with at most three solids (a bar, pillars or platforms, all 4 m high) and at most one movable
 block. The outer walls are four planes, the cheapest shape for collisions, and solids are boxes.
@@ -13,15 +13,13 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float
 
-from taic_jax.envs.robots import ANT_BIT
+from taic_jax.envs.robots import BODY_BIT, LIGHT
 
-ANT_QPOS, ANT_QVEL = 15, 14  # the ant's share of qpos and qvel; a block's follows
 SOLID_HEIGHT = 4.0  # m
 TOLERANCE = 0.05  # m, by which a block may overrun its soft limits
-MASS = 0.1  # kg of whatever the ant pushes; HIRO's 0.2 and 1 g go through walls at a steady push
-FENCE = 2.0  # m from the ant at its start
+FENCE = 2.0  # m from the robot at its start
 
-# Bits of contype and conaffinity for pairs that may collide. The ant collides with everything but itself, a block with
+# Bits of contype and conaffinity for pairs that may collide. The body collides with everything, a block with
 # the solids that its arena names; elsewhere its joint limits stop it, and contacts would make it jam.
 _BLOCK = 2
 _GEOM = mujoco.mjtGeom
@@ -36,12 +34,12 @@ class Slide:
 
     axis: tuple[float, float, float]
     limits: tuple[float, float]  # m
-    damping: float  # N s/m
+    damping: float  # N s/m, at the mass that an ant pushes
 
 
 @dataclasses.dataclass(frozen=True)
 class Block:
-    """A box that the ant can push."""
+    """A box that the robot can push."""
 
     centre: tuple[float, float, float]  # m
     slides: tuple[Slide, ...]
@@ -55,7 +53,7 @@ Box = tuple[float, float, float, float]  # x_low, y_low, x_high, y_high
 
 @dataclasses.dataclass(frozen=True)
 class Arena:
-    """A room, in m, with the ant's start at the origin of x and y."""
+    """A room, in m, with the robot's start at the origin of x and y."""
 
     room: Box
     solids: tuple[Box, ...]
@@ -63,7 +61,7 @@ class Arena:
     near_goal: tuple[float, ...] | None = None  # one without obstacles before it
     # A way to the goal: the place to go to next from anywhere in a rectangle, the first that one is in.
     ways: tuple[tuple[Box, tuple[float, float]], ...] = ()
-    ground: float = 0.0  # height of the ground on which the ant starts
+    ground: float = 0.0  # height of the ground on which the robot starts
     block: Block | None = None
 
 
@@ -102,31 +100,31 @@ FALL = Arena(
 )
 
 
-def furnish(spec: mujoco.MjSpec, arena: Arena) -> None:
-    """Put the ant of `spec`, with the contacts of its body, into the arena."""
+def furnish(spec: mujoco.MjSpec, arena: Arena, mass: float) -> None:
+    """Put the robot of `spec`, with the contacts of its body, into the arena, with a block of that mass in kg."""
     for geom in spec.geoms:
         if geom.name == "floor":
             geom.material, geom.rgba = "", _GROUND
-        else:
+        elif not geom.meshname:  # meshes have their own colours
             geom.rgba = _BODY  # visible from above
     _add_walls(spec, arena)
     for i, (x_low, y_low, x_high, y_high) in enumerate(arena.solids):
-        meets = ANT_BIT | (_BLOCK if arena.block and i in arena.block.meets else 0)
+        meets = BODY_BIT | (_BLOCK if arena.block and i in arena.block.meets else 0)
         pos = ((x_low + x_high) / 2, (y_low + y_high) / 2, SOLID_HEIGHT / 2)
         half = ((x_high - x_low) / 2, (y_high - y_low) / 2, SOLID_HEIGHT / 2)
         shape = {"type": _GEOM.mjGEOM_BOX, "pos": pos, "size": half, "rgba": _WALL}
         spec.worldbody.add_geom(name=f"solid_{i}", **shape, contype=0, conaffinity=meets)
     if arena.block:
         block = arena.block
-        _add_movable(spec, "block", block.centre, block.slides, [((0.0, 0.0, 0.0), block.half)])
+        _add_movable(spec, "block", block.centre, block.slides, [((0.0, 0.0, 0.0), block.half)], mass)
     goal = (*arena.goal, arena.ground + 0.5)[:3]
     spec.worldbody.add_site(name="goal", pos=goal, size=[0.5] * 3, rgba=_GOAL)
-    spec.body("torso").pos[2] += arena.ground
+    spec.worldbody.first_body().pos[2] += arena.ground
     _add_camera(spec, arena)
 
 
 def is_open(arena: Arena, place: Float[Array, " 2"], width: float = 0.0) -> Bool[Array, ""]:
-    """Return whether an ant can be at a place in the room: on a platform, or out of all solids.
+    """Return whether a robot can be at a place in the room: on a platform, or out of all solids.
 
     With a `width` in m it can start there: it has this distance from walls, edges and the block.
     """
@@ -153,9 +151,10 @@ def outside(arena: Arena, qpos: Float[np.ndarray, "*batch nq"]) -> int:
     wrong = (x < x_low) | (x > x_high) | (y < y_low) | (y > y_high) | (z < 0)
     for a, b, c, d in arena.solids:
         wrong |= (x > a) & (x < c) & (y > b) & (y < d) & (z < SOLID_HEIGHT)
-    for i, slide in enumerate(arena.block.slides if arena.block else ()):
+    slides = arena.block.slides if arena.block else ()
+    for slide, along in zip(slides, np.moveaxis(qpos[..., qpos.shape[-1] - len(slides) :], -1, 0), strict=True):
         low, high = slide.limits
-        wrong |= (qpos[..., ANT_QPOS + i] < low - TOLERANCE) | (qpos[..., ANT_QPOS + i] > high + TOLERANCE)
+        wrong |= (along < low - TOLERANCE) | (along > high + TOLERANCE)
     return int(wrong.sum())
 
 
@@ -169,33 +168,37 @@ def _add_walls(spec: mujoco.MjSpec, arena: Arena) -> None:
     for name, (place, inward) in sides.items():
         half_length = (y_high - y_low if inward[0] else x_high - x_low) / 2
         shape = {"type": _GEOM.mjGEOM_PLANE, "pos": (*place, height / 2), "size": (height / 2, half_length, 1)}
-        wall = spec.worldbody.add_geom(name=name, **shape, rgba=_WALL, contype=0, conaffinity=ANT_BIT)
+        wall = spec.worldbody.add_geom(name=name, **shape, rgba=_WALL, contype=0, conaffinity=BODY_BIT)
         # A plane's normal is its z axis; its x axis, the first of its sizes in a picture, points up.
         wall.alt.type = mujoco.mjtOrientation.mjORIENTATION_XYAXES
         wall.alt.xyaxes = (0, 0, 1, inward[1], -inward[0], 0)
 
 
-def enclose(spec: mujoco.MjSpec) -> None:
-    """Put a light fence around the ant, which it pushes along wherever it goes."""
+def enclose(spec: mujoco.MjSpec, mass: float) -> None:
+    """Put a light fence of that mass in kg around the robot, which it pushes along wherever it goes."""
     away, thin, wide, high = FENCE + 0.25, 0.25, FENCE + 0.5, SOLID_HEIGHT / 2
     sides = [((x, 0.0, 0.0), (thin, wide, high)) for x in (away, -away)]
     sides += [((0.0, y, 0.0), (wide, thin, high)) for y in (away, -away)]
-    _add_movable(spec, "fence", (0.0, 0.0, high), (_FREE_X, _FREE_Y), sides)
+    _add_movable(spec, "fence", (0.0, 0.0, high), (_FREE_X, _FREE_Y), sides, mass)
 
 
 def _add_movable(
-    spec: mujoco.MjSpec, name: str, centre: Point, slides: Sequence[Slide], boxes: Sequence[tuple[Point, Point]]
-) -> None:
-    """Add a body of boxes, each given by its centre from the body's and its half sizes."""
+    spec: mujoco.MjSpec, name: str, centre: Point, slides: Sequence[Slide], boxes: Sequence[tuple[Point, Point]],
+    mass: float,
+) -> None:  # fmt: skip
+    """Add a body of boxes, each given by its centre from the body's and its half sizes; it does not touch the floor."""
+    for geom in spec.geoms:
+        if geom.name == "floor":
+            geom.contype = 0
     body = spec.worldbody.add_body(name=name, pos=centre)
     for i, slide in enumerate(slides):
         body.add_joint(
             name=f"{name}_{i}", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=slide.axis, armature=0,
-            limited=mujoco.mjtLimited.mjLIMITED_TRUE, range=slide.limits, damping=[slide.damping, 0, 0],
+            limited=mujoco.mjtLimited.mjLIMITED_TRUE, range=slide.limits, damping=[slide.damping * mass / LIGHT, 0, 0],
         )  # fmt: skip
     for i, (pos, half) in enumerate(boxes):
-        shape = {"type": _GEOM.mjGEOM_BOX, "pos": pos, "size": half, "mass": MASS / len(boxes), "rgba": _MOVABLE}
-        body.add_geom(name=f"{name}_{i}", **shape, contype=_BLOCK, conaffinity=ANT_BIT)
+        shape = {"type": _GEOM.mjGEOM_BOX, "pos": pos, "size": half, "mass": mass / len(boxes), "rgba": _MOVABLE}
+        body.add_geom(name=f"{name}_{i}", **shape, contype=_BLOCK, conaffinity=BODY_BIT)
 
 
 def _add_camera(spec: mujoco.MjSpec, arena: Arena) -> None:

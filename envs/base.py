@@ -11,30 +11,54 @@ from flax import struct
 from jax import Array
 from jaxtyping import Float, Key
 
+from taic_jax.envs.errors import ModelError
 from taic_jax.envs.views import Views, one_view
 
 
 class PhysicsState(struct.PyTreeNode):
-    """The whole memory of a MuJoCo simulation between two ticks."""
+    """The whole memory of a MuJoCo simulation between two ticks, and what its sensors read."""
 
     qpos: Array  # [nq] generalised positions
     qvel: Array  # [nv] generalised velocities
     qacc_warmstart: Array  # [nv] accelerations from which the constraint solver starts
+    # None unless the model has activations, and unless the physics was made with sensors.
+    act: Array | None = struct.field(default=None, kw_only=True)  # [na] activations of actuators
+    sensordata: Array | None = struct.field(default=None, kw_only=True)  # [nsensordata] before the latest substep
 
 
 class Physics(abc.ABC):
-    """A model's dynamics on one backend; a tick has `substeps` engine steps."""
+    """A model's dynamics on one backend; a tick has `substeps` engine steps.
 
-    def __init__(self, model: mujoco.MjModel, substeps: int):
-        self.model, self.substeps = model, substeps
+    Equalities are as in the model, active or not. With `sensors` the state has what they read.
+
+    Raises:
+      ModelError: the model has state that `PhysicsState` cannot carry.
+    """
+
+    def __init__(self, model: mujoco.MjModel, substeps: int, sensors: bool = False):
+        without_field = {
+            "mocap bodies": model.nmocap, "plugins": model.nplugin, "delays": model.nhistory,
+            "plastic deformation": model.nplastic, "sleep": model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP,
+        }  # fmt: skip
+        for content, present in without_field.items():
+            if present:
+                raise ModelError(model_name(model), f"got {content}, which the state of the physics cannot carry")
+        self.model, self.substeps, self.sensors = model, substeps, sensors
 
     def init(self, qpos: Float[Array, " nq"], qvel: Float[Array, " nv"]) -> PhysicsState:
-        """Make the state from which an episode starts; needs no forward pass."""
-        return PhysicsState(qpos=qpos, qvel=qvel, qacc_warmstart=jnp.zeros_like(qvel))
+        """Make the state from which an episode starts; needs no forward pass: sensors read 0."""
+        act = jnp.zeros(self.model.na) if self.model.na else None
+        sensordata = jnp.zeros(self.model.nsensordata) if self.sensors else None
+        return PhysicsState(qpos, qvel, jnp.zeros_like(qvel), act=act, sensordata=sensordata)
 
     @abc.abstractmethod
     def step(self, state: PhysicsState, ctrl: Float[Array, " nu"]) -> PhysicsState:
         """Advance by one tick, i.e. all its substeps, under constant controls."""
+
+
+def model_name(model: mujoco.MjModel) -> str:
+    """Return the name that the MJCF gives its model."""
+    return model.names.partition(b"\0")[0].decode()
 
 
 class State(struct.PyTreeNode):

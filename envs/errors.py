@@ -46,6 +46,13 @@ class AdapterError(ValueError):
     """An environment that does not fit an adapter, or a wrong use of an adapter."""
 
 
+class ModelError(ValueError):
+    """A robot's model that lacks what a task needs, or has what the physics cannot carry; one line."""
+
+    def __init__(self, name: str, problem: str):
+        super().__init__(f"model {name}: {problem}")
+
+
 class ContractError(ValueError):
     """An environment that breaks the contract of `Env`; the message starts with its name and the field."""
 

@@ -1,4 +1,4 @@
-"""The four running robots as data: MJCF, and the constants of Gym's reward, start and end."""
+"""Running robots as data: MJCF, and the constants of Gym's reward, start and end."""
 
 import dataclasses
 import importlib.util
@@ -9,15 +9,18 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from taic_jax.envs.errors import MissingExtraError, UnknownNameError
+from taic_jax.envs.base import model_name
+from taic_jax.envs.errors import MissingExtraError, ModelError, UnknownNameError
 from taic_jax.envs.views import Signed
+
+LIGHT = 0.1  # kg of whatever an ant pushes; HIRO's 0.2 and 1 g go through walls at a steady push
 
 
 @dataclasses.dataclass(frozen=True)
 class Robot:
     """A body and the constants of its tasks."""
 
-    mjcf: tuple[str, str]  # package that ships it, path in it
+    mjcf: tuple[str, str]  # package that ships it, path in it or of any file
     num_unobserved: int  # leading entries of qpos left out of obs: the place on the ground
     control_cost: float  # weight of |action|^2
     reset_noise: float  # half-width on qpos; see also velocity_noise
@@ -28,12 +31,15 @@ class Robot:
     height_index: int = 1  # entry of qpos that holds the torso's height ...
     root_height: float = 0.0  # m, ... above this
     healthy_height: tuple[float, float] = (-math.inf, math.inf)  # m; outside it the episode ends
-    healthy_angle: float = math.inf  # rad, of a planar robot's pitch, qpos[2], to either side
+    healthy_angle: float = math.inf  # rad, of a planar robot's pitch, qpos[2], or of a free one's axis to the vertical
     healthy_state: float = math.inf  # for every entry of qpos and qvel behind the first two
     velocity_limit: float = math.inf  # at which velocities are clipped in obs
     start_in_default_pose: bool = False  # and not in the model's numeric `init_qpos`
+    keyframe: str = ""  # to start in, if not empty
+    reach: float = 0.0  # rad from the start's angles, of position servos at an action of 1; 0 for motors
     episode_length: int = 1000  # ticks
-    contacts: str = "feet"  # of the ant with the ground: of its feet alone, or of the whole `body`
+    contacts: str = "feet"  # with the ground: of the ant's feet alone, or of the whole `body`; or the model's `own`
+    pushes: float = LIGHT  # kg, of a block or a fence in its way
     proprioception: str = ""  # name of the slice of obs that its tasks share; empty for the task's
     # Settings of the engine; None for the model's own.
     timestep: float | None = None  # s
@@ -93,7 +99,7 @@ def _as_in_gym(robot: Robot, file: str) -> Robot:
 
 
 BODIES = ("gym", "hiro")  # Bodies of the ant, by the config's `env.body`.
-ANT_BIT = 1  # of contype and conaffinity
+BODY_BIT = 1  # of contype and conaffinity
 CONTACTS = ("feet", "body")  # Geoms of the ant that touch the ground, by `env.contacts`.
 
 # Robots by the config's `env.model`. `gym` is Gymnasium's own MJCF, integrator and rules of version 5, without the
@@ -143,20 +149,39 @@ def load_spec(robot: Robot) -> mujoco.MjSpec:
         actuator.gear[0] = robot.gear
     if robot.contacts == "body":
         _touch_with_body(spec)
+    if robot.keyframe:
+        _start_in(spec, np.array(spec.key(robot.keyframe).qpos))
     return spec
 
 
+def _start_in(spec: mujoco.MjSpec, pose: Float[np.ndarray, " nq"]) -> None:
+    """Keep a pose as the numeric `init_qpos`, and its height as the default one; add a camera that follows.
+
+    Keyframes go: they would not fit the model any more once something else moves in it.
+    """
+    spec.add_numeric(name="init_qpos", data=pose, size=len(pose))
+    root, height = spec.worldbody.first_body(), pose[2]
+    root.pos[2] = height
+    for key in list(spec.keys):
+        spec.delete(key)
+    if spec.camera("track") is None:
+        mode = mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM
+        camera = root.add_camera(name="track", pos=(0, -7 * height, height), mode=mode)
+        camera.alt.type = mujoco.mjtOrientation.mjORIENTATION_XYAXES
+        camera.alt.xyaxes = (1, 0, 0, 0, 0.15, 1)
+
+
 def _touch_with_body(spec: mujoco.MjSpec) -> None:
-    """Let the whole ant collide with whatever has `ANT_BIT` in its conaffinity, and with nothing of itself.
+    """Let the whole ant collide with whatever has `BODY_BIT` in its conaffinity, and with nothing of itself.
 
     The floor collides with the same shapes as with feet alone: the foot spheres are the ends of the ankles' capsules.
     """
     for geom in spec.geoms:
         if geom.name == "floor":
-            geom.conaffinity = ANT_BIT
+            geom.conaffinity = BODY_BIT
         else:
             is_foot = geom.type == mujoco.mjtGeom.mjGEOM_SPHERE and geom.name != "torso_geom"
-            geom.contype, geom.conaffinity = (0, 0) if is_foot else (ANT_BIT, 0)
+            geom.contype, geom.conaffinity = (0, 0) if is_foot else (BODY_BIT, 0)
 
 
 def compile_spec(spec: mujoco.MjSpec) -> mujoco.MjModel:
@@ -175,3 +200,14 @@ def initial_qpos(robot: Robot, model: mujoco.MjModel) -> Float[np.ndarray, " nq"
     if index < 0 or robot.start_in_default_pose:
         return model.qpos0
     return model.numeric("init_qpos").data
+
+
+def servo_angles(model: mujoco.MjModel, qpos: Float[np.ndarray, " n"]) -> Float[np.ndarray, " nu"]:
+    """Return the angles that the servos hold in a pose; raise `ModelError` if an actuator is no servo of a joint."""
+    of_joint = model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
+    is_servo = of_joint & (model.actuator_gainprm[:, 0] > 0) & (model.actuator_biasprm[:, 1] < 0)
+    if not is_servo.all():
+        index = int(np.argmin(is_servo))
+        name = model.actuator(index).name or index
+        raise ModelError(model_name(model), f"got actuator {name}, expected position servos of joints alone")
+    return qpos[model.jnt_qposadr[model.actuator_trnid[:, 0]]]

@@ -29,11 +29,11 @@ class MjxPhysics(Physics):
 
     def __init__(
         self, model: mujoco.MjModel, substeps: int, iterations: int | None = None, ls_iterations: int | None = None,
-        *, warp: bool = False,
+        *, sensors: bool = False, warp: bool = False,
     ):  # fmt: skip
         if warp:
             _require_warp()
-        super().__init__(model, substeps)
+        super().__init__(model, substeps, sensors)
         impl = "warp" if warp else "jax"
         with third_party():
             mjx_model = mjx.put_model(model, impl=impl)
@@ -46,9 +46,12 @@ class MjxPhysics(Physics):
 
     def step(self, state: PhysicsState, ctrl: Float[Array, " nu"]) -> PhysicsState:
         def substep(state: PhysicsState, _: None) -> tuple[PhysicsState, None]:
-            data = self._data.replace(qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.qacc_warmstart, ctrl=ctrl)
-            data = mjx.step(self._model, data)
-            return state.replace(qpos=data.qpos, qvel=data.qvel, qacc_warmstart=data.qacc_warmstart), None
+            act = {} if state.act is None else {"act": state.act}
+            data = self._data.replace(qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.qacc_warmstart, **act)
+            data = mjx.step(self._model, data.replace(ctrl=ctrl))
+            carried = {"qpos": data.qpos, "qvel": data.qvel, "qacc_warmstart": data.qacc_warmstart}
+            act = None if state.act is None else data.act
+            return state.replace(**carried, act=act, sensordata=data.sensordata if self.sensors else None), None
 
         with third_party():
             return jax.lax.scan(substep, state, length=self.substeps)[0]

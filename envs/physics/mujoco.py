@@ -20,7 +20,8 @@ from taic_jax.envs.physics.watchdog import Watchdog
 
 # Contents of a call, in the order of MuJoCo's state rows, where only the time precedes it.
 _STATE, _WARNING = mujoco.mjtState, mujoco.mjtWarning
-_SENT = sum(x.value for x in (_STATE.mjSTATE_QPOS, _STATE.mjSTATE_QVEL, _STATE.mjSTATE_WARMSTART, _STATE.mjSTATE_CTRL))
+_CARRIED = _STATE.mjSTATE_QPOS, _STATE.mjSTATE_QVEL, _STATE.mjSTATE_ACT, _STATE.mjSTATE_WARMSTART
+_SENT = sum(x.value for x in (*_CARRIED, _STATE.mjSTATE_CTRL))
 # After these warnings MuJoCo has put the simulation back to its initial pose.
 _DIVERGED = [x.value for x in (_WARNING.mjWARN_BADQPOS, _WARNING.mjWARN_BADQVEL, _WARNING.mjWARN_BADQACC)]
 PATIENCE = 60.0
@@ -35,28 +36,27 @@ class MujocoPhysics(Physics):
     """A host call of `mujoco.batch.Batch`; all leading axes (seeds, environments) are one engine call.
 
     It is pure: the result depends on the arguments alone, at any number of threads. Each call overwrites every state
-    field that `mj_step` reads (qpos, qvel, qacc_warmstart, ctrl). The others never change: models with activations,
-    mocap bodies, plugins or equalities are refused, no forces are applied, and the time enters no force. A simulation
-    that diverges returns NaN. Later changes of the model have no effect. For arguments see `make_physics`.
-
-    Raises:
-      ValueError: the model has state that is not in `PhysicsState`.
+    field that `mj_step` reads (qpos, qvel, act, qacc_warmstart, ctrl). The others never change: equalities are active
+    or not as in the model, no forces are applied, and the time enters no force. A simulation that diverges returns NaN.
+    Later changes of the model have no effect. For arguments and errors see `make_physics`.
     """
 
-    def __init__(self, model: mujoco.MjModel, substeps: int, num_threads: int = 0):
-        if model.na or model.nhistory or model.nmocap or model.nplugin or model.neq:
-            raise ValueError("the model must have no activations, mocap bodies, plugins or equalities")
-        super().__init__(model, substeps)
+    def __init__(self, model: mujoco.MjModel, substeps: int, num_threads: int = 0, *, sensors: bool = False):
+        super().__init__(model, substeps, sensors)
         self.num_threads = num_threads or max(1, num_physical_cores() // jax.local_device_count())
         saved = np.empty(mujoco.mj_sizeModel(model), np.uint8)
         mujoco.mj_saveModel(model, None, saved)
-        self.engine = _engine(saved.tobytes(), substeps, self.num_threads)
+        self.engine = _engine(saved.tobytes(), substeps, self.num_threads, sensors)
 
     def step(self, state: PhysicsState, ctrl: Float[Array, " nu"]) -> PhysicsState:
-        nq, nv = self.model.nq, self.model.nv
-        sent = jnp.concatenate([state.qpos, state.qvel, state.qacc_warmstart, ctrl])
+        model = self.model
+        act = [] if state.act is None else [state.act]
+        sent = jnp.concatenate([state.qpos, state.qvel, *act, state.qacc_warmstart, ctrl])
         after = self.engine.call(sent, self.engine.num_returned)
-        return state.replace(qpos=after[:nq], qvel=after[nq : nq + nv], qacc_warmstart=after[nq + nv :])
+        ends = np.cumsum([model.nq, model.nv, model.na, model.nv])
+        qpos, qvel, act, warmstart, sensordata = jnp.split(after, ends)
+        read = {"act": act if model.na else None, "sensordata": sensordata if self.sensors else None}
+        return state.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart, **read)
 
 
 class Engine:
@@ -65,8 +65,9 @@ class Engine:
     The name is of this engine's host call alone, and nothing else changes its model.
     """
 
-    def __init__(self, name: str, model: mujoco.MjModel, substeps: int, num_threads: int):
-        self.num_returned = model.nq + 2 * model.nv
+    def __init__(self, name: str, model: mujoco.MjModel, substeps: int, num_threads: int, sensors: bool):
+        self._num_carried = mujoco.mj_stateSize(model, sum(x.value for x in _CARRIED))
+        self.num_returned = self._num_carried + (model.nsensordata if sensors else 0)
         self.call = HostFunction(name, self.step)
         self._model, self._substeps, self._num_threads = model, substeps, num_threads
         self._watchdog = Watchdog(PATIENCE, LATE)
@@ -82,11 +83,14 @@ class Engine:
             batch = idle.pop()  # a batch serves one caller at a time
         except IndexError:
             batch = mujoco.batch.Batch(self._model, len(sent), min(self._num_threads, len(sent)))
+            batch.bind("sensordata")  # before its first call, or it reads 0
         rows = batch.state[:, self._sent]
         rows[...] = sent
         with self._watchdog:
             batch.step(nstep=self._substeps)
-        after[...] = rows[:, : self.num_returned]
+        after[:, : self._num_carried] = rows[:, : self._num_carried]
+        if self.num_returned > self._num_carried:
+            after[:, self._num_carried :] = batch.sensordata
         if batch.warning.any():  # [simulations, kinds, (last info, count)]
             after[batch.warning[:, _DIVERGED, 1].any(axis=1)] = np.nan
             batch.warning[...] = 0
@@ -94,11 +98,12 @@ class Engine:
 
 
 @functools.cache
-def _engine(model: bytes, substeps: int, num_threads: int) -> Engine:
+def _engine(model: bytes, substeps: int, num_threads: int, sensors: bool) -> Engine:
     """Return the engine of a saved model: one a process, since compiled programs call it by its name."""
     digest = hashlib.sha256(model).hexdigest()[:16]
     loaded = mujoco.MjModel.from_binary_path("model.mjb", {"model.mjb": model})
-    return Engine(f"taic_jax_mujoco_{digest}_{substeps}_{num_threads}", loaded, substeps, num_threads)
+    name = f"taic_jax_mujoco_{digest}_{substeps}_{num_threads}{'_sensors' if sensors else ''}"
+    return Engine(name, loaded, substeps, num_threads, sensors)
 
 
 def num_physical_cores() -> int:

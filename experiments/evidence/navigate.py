@@ -14,9 +14,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Key
 
 from taic_jax.analysis.option_space import always
-from taic_jax.envs.ant_tasks import BODY_WIDTH, SUCCESS_RADIUS, upside_down
+from taic_jax.envs.ant_tasks import BODY_WIDTH, SUCCESS_RADIUS
 from taic_jax.envs.arenas import SOLID_HEIGHT, Arena
 from taic_jax.envs.base import Env, State
+from taic_jax.envs.orientation import upside_down
 from taic_jax.envs.wrappers import AutoReset, Wrapper
 from taic_jax.options.execution import Executor
 from taic_jax.options.frame import Frame

@@ -8,8 +8,8 @@ import pytest
 from ants import placed, start, task
 
 from taic_jax.envs import AutoReset, UnknownNameError, make_env
-from taic_jax.envs.ant_tasks import heading, upside_down, wrapped
 from taic_jax.envs.arenas import outside
+from taic_jax.envs.orientation import heading, upside_down, wrapped
 from taic_jax.envs.third_party import third_party
 
 ARENAS = ("ant_maze", "ant_push", "ant_fall")

@@ -9,8 +9,9 @@ import pytest
 from ants import placed, start, task
 
 from taic_jax.config import PPOConfig, SACConfig
-from taic_jax.envs import AntArena, AutoReset, UnknownNameError, make_env
+from taic_jax.envs import ArenaTask, AutoReset, UnknownNameError, make_env
 from taic_jax.envs.arenas import PUSH, outside
+from taic_jax.envs.robots import ROBOTS
 from taic_jax.options.execution import IdentityExecutor
 from taic_jax.rl import ppo, sac
 
@@ -43,7 +44,7 @@ def test_near_goal_is_straight_ahead_and_the_fixed_one_behind_a_wall():
         np.testing.assert_allclose(state.reward, [0, -16], atol=0.1)
         np.testing.assert_array_equal(state.metrics["success"], [1, 0])
     with pytest.raises(UnknownNameError, match="goal"):
-        AntArena("ant_push", PUSH, "gym", goal="near")
+        ArenaTask("ant_push", PUSH, ROBOTS["brax"]["ant"], goal="near")
 
 
 @pytest.mark.parametrize(("name", "height"), [("ant_push", None), ("ant_fall", 4.5)])

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from taic_jax.envs import make_env
-from taic_jax.envs.ant_tasks import upside_down
+from taic_jax.envs.orientation import upside_down
 
 CELL = 1.0  # m; every edge is at a multiple of it
 

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from quadruped import write_checkout
 
 from taic_jax import run
 from taic_jax.command_line import typed
@@ -221,7 +222,10 @@ def test_examples_train_by_the_command_line(name, tmp_path, monkeypatch):
     assert {"summary.json", "video.webp", "options"} <= {path.name for path in (tmp_path / "run").iterdir()}
 
 
-@pytest.mark.parametrize("path", sorted([*EXAMPLES.glob("pendulum.*"), *EXAMPLES.glob("reacher_arm.*")]), ids=str)
+SHOWN = sorted(path for name in ("pendulum", "reacher_arm", "sidestep") for path in EXAMPLES.glob(f"{name}.*"))
+
+
+@pytest.mark.parametrize("path", SHOWN, ids=str)
 def test_the_guide_holds_the_examples_word_for_word(path):
     language = {".py": "python", ".yaml": "yaml"}[path.suffix]
     blocks = re.findall(rf"^```{language}\n(.*?)^```$", GUIDE, re.MULTILINE | re.DOTALL)
@@ -235,8 +239,11 @@ def commands() -> list[str]:
 
 
 @pytest.mark.parametrize("command", commands())
-def test_commands_of_the_guide_are_valid(command, monkeypatch):
+def test_commands_of_the_guide_are_valid(command, monkeypatch, tmp_path):
     monkeypatch.chdir(ROOT)
+    if "sidestep" in command:
+        pytest.importorskip("mujoco_menagerie")
+        monkeypatch.setenv("MENAGERIE_ROOT", str(write_checkout(tmp_path)))
     program, *args = shlex.split(command)
     if program == "python":
         assert args[1] == "taic_jax.run" and run.main([*args[2:], "--dry-run", "--quiet"]) == 0

@@ -125,15 +125,6 @@ def test_auto_takes_the_engine_on_cpu():
     assert isinstance(make_physics(model("ant")[0], 5, "auto"), MujocoPhysics)
 
 
-def test_a_model_with_more_state_is_refused():
-    import mujoco
-
-    xml = """<mujoco><worldbody><body><joint name="j"/><geom size="1"/></body></worldbody>
-      <actuator><position joint="j" timeconst="1"/></actuator></mujoco>"""
-    with pytest.raises(ValueError, match="no activations"):
-        MujocoPhysics(mujoco.MjModel.from_xml_string(xml), 1)
-
-
 @pytest.mark.parametrize(
     "name", ["ant", *(pytest.param(n, marks=pytest.mark.slow) for n in ("half_cheetah", "hopper", "walker2d"))]
 )
