@@ -74,7 +74,7 @@ def load(source: str | Path) -> Handle:
         raise ArtifactError(f"{path}: expected a finished run, got one that --resume goes on with")
     if run.begun or (path / AGENTS).is_dir():
         folders = sorted(folder for folder in (path / AGENTS).glob("*") if folder.is_dir())
-        if not folders and (path / OPTIONS).is_dir():
+        if not folders and (path / OPTIONS).is_dir() and read_body(path / OPTIONS).proprioception == DATA:
             return _load_model(path / OPTIONS, run.config())
         if path / AGENTS / TAIC not in folders:
             raise ArtifactError(f"{path / AGENTS}: expected the agents that a run of this version leaves, got none")
