@@ -182,7 +182,7 @@ def as_table(summary: "Summary") -> Any:
     table = Table("measure", "interquartile mean", "95 % interval", box=SIMPLE, title="options", title_justify="left")
     for name, statistics in summary.get("options", {}).items():
         numbers = statistics["iqm"], *(statistics["ci95"] or ())
-        iqm, *interval = ("" if x is None else f"{x:.3g}" for x in numbers)
+        iqm, *interval = [f"{x:.3g}" for x in numbers if x is not None] or ["not finite"]
         table.add_row(name, iqm, " … ".join(interval))
     return table
 
