@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     from taic_jax.analysis.evaluate import evaluate, record
     from taic_jax.analysis.measures import measure_option_space
     from taic_jax.analysis.statistics import bootstrap_interval, iqm
-    from taic_jax.artifacts.demonstrations import read_demonstrations
     from taic_jax.artifacts.experience import collect
     from taic_jax.artifacts.models import load_options
     from taic_jax.config import (
@@ -27,6 +26,7 @@ if TYPE_CHECKING:
     )
     from taic_jax.config.files import load_config
     from taic_jax.config.learners import DQNConfig, PPOConfig, SACConfig
+    from taic_jax.data.read import read_data
     from taic_jax.envs import AutoReset, Env, State, environment_names, make_env
     from taic_jax.envs.adapters import to_gymnasium
     from taic_jax.handles.load import Handle, load
@@ -45,9 +45,9 @@ _MODULES = {
     "config": "CollectConfig Config EnvConfig EvaluateConfig FineTuneConfig OptionsConfig TrainConfig",
     "config.learners": "DQNConfig PPOConfig SACConfig",
     "config.files": "load_config",
+    "data.read": "read_data",
     "envs": "AutoReset Env State environment_names make_env",
     "envs.adapters": "to_gymnasium",
-    "artifacts.demonstrations": "read_demonstrations",
     "artifacts.experience": "collect",
     "artifacts.models": "load_options",
     "handles.load": "Handle load",

@@ -12,6 +12,7 @@ from taic_jax.config.files import nearest
 # A command's module, imported once it is called, and its line in the help.
 COMMANDS = {
     "run": ("run", "train: collect, learn options, act by choosing them, evaluate"),
+    "learn": ("from_data", "learn options from recorded data alone, without a simulator"),
     "sweep": ("sweep.__main__", "train at many points of the config, several in one program"),
     "play": ("handles.play", "film the agents of a finished run"),
     "evaluate": ("handles.assess", "evaluate them anew: other episodes, tasks, noise"),
@@ -39,7 +40,8 @@ def main(args: Sequence[str] | None = None) -> int:
         return tell(lambda: _about(name))
     module = importlib.import_module(f"taic_jax.{COMMANDS[name][0]}")
     if name == "completion":
-        later = {x: importlib.import_module(f"taic_jax.{COMMANDS[x][0]}").Command for x in ("run", "sweep", "report")}
+        names = "run", "learn", "sweep", "report"
+        later = {x: importlib.import_module(f"taic_jax.{COMMANDS[x][0]}").Command for x in names}
         return tell(lambda: module.complete(rest, COMMANDS, later))
     return module.main(rest)
 

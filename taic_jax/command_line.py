@@ -227,7 +227,8 @@ def _explain(args: Sequence[str], command: type) -> ConfigError:
     """Return the error for the argument that tyro refused, by parsing each option alone."""
     types = {name.removeprefix("config."): kind for name, kind in field_types(command).items()}
     configured = types.pop("source", None)
-    types.pop("runs", None)  # the positional argument of reports
+    for positional in ("runs", "data"):
+        types.pop(positional, None)
     starts = [i for i, arg in enumerate(args) if re.match(r"-(?!inf|nan|[\d.])", arg, re.IGNORECASE)]
     for start, end in itertools.pairwise([*starts, len(args)]):
         option, equals, value = args[start].partition("=")

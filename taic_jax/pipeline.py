@@ -12,13 +12,14 @@ import jax.numpy as jnp
 from taic_jax import trainer
 from taic_jax.artifacts.agents import Weights, save_agents
 from taic_jax.artifacts.experience import EXPERIENCE, ExperienceStore, gather_experience, num_blocks
-from taic_jax.artifacts.models import AGENTS, OPTIONS, describe, save_options
+from taic_jax.artifacts.models import AGENTS, OPTIONS, Body, describe, save_options
 from taic_jax.config import (
     COLLECT,
     PRACTISE,
     TAIC,
     Config,
     ConfigError,
+    OptionsConfig,
     Shard,
     collector_is_baseline,
     impossible,
@@ -180,9 +181,9 @@ def collect(run: Run, env: Env) -> Trained:
     return trained
 
 
-def learn(run: Run, env: Env) -> OptionModel:
-    """Learn one option model per seed from the experience and save it as the artifact `options`."""
-    config, dataset = run.config.options, select_windows(run, env)
+def learn(run: Run, env: Env | Body, dataset: Dataset | None = None) -> OptionModel:
+    """Learn one option model per seed, by default from the experience, and save it as the artifact `options`."""
+    config, dataset = run.config.options, select_windows(run, env) if dataset is None else dataset
     state = jax.jit(partial(trainer.init_learning, env))(config, run.stage_keys("learn"))
     if config.steps:  # without steps D stays random
         step, unit = trainer.learn_rows, trainer.steps_per_log(config)
@@ -207,7 +208,7 @@ def practise(run: Run, env: Env, model: OptionModel) -> OptionModel:
     return model
 
 
-def select_windows(run: Run, env: Env) -> Dataset:
+def select_windows(run: Run, env: Env | Body) -> Dataset:
     """Return the windows that each seed learns options from.
 
     Raises:
@@ -219,11 +220,21 @@ def select_windows(run: Run, env: Env) -> Dataset:
     sources = [
         gather_experience(run.folder.path, env, rows)
         if name == COLLECT
-        else _for_points(gather_experience(Path(name), env, seeds), rows // seeds)
+        else _for_points(gather_experience(Path(name), env, seeds, config, run.logger.say), rows // seeds)
         for name in names
     ]
-    select = jax.vmap(partial(make_dataset, views=env.views, frame=make_frame(config, env.heading)))
-    dataset = _compile_rows(run, "learn", select, sources, config)(sources, config)
+    select = windows_of(env, config)
+    return checked(_compile_rows(run, "learn", select, sources, config)(sources, config), config)
+
+
+def windows_of(env: Env | Body, config: OptionsConfig) -> Callable[..., Dataset]:
+    """Return the function that selects the windows [K] of experiences [K] by configs [K]."""
+    return jax.vmap(partial(make_dataset, views=env.views, frame=make_frame(config, env.heading)))
+
+
+def checked(dataset: Dataset, config: OptionsConfig) -> Dataset:
+    """Return a dataset [K] that has the windows that the configs [K] need, or raise ConfigError."""
+    names = config.experience or (COLLECT,)
     span = f"in {', '.join(names)} between its shares {jnp.min(config.since):g} and {jnp.max(config.until):g}"
     if config.codes and (fewest := int(dataset.count.min())) < config.codes:
         raise impossible("options.codes", config.codes, f"at most the {fewest} windows {span}", fewest)

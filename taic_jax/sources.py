@@ -9,7 +9,7 @@ import psutil
 
 from taic_jax.artifacts.agents import Weights, load_policy, load_taic
 from taic_jax.artifacts.experience import gather_experience
-from taic_jax.artifacts.models import describe, load_options
+from taic_jax.artifacts.models import Body, describe, load_options
 from taic_jax.config import (
     COLLECT,
     PRACTISE,
@@ -50,10 +50,7 @@ def make_envs(config: Config) -> tuple[Env, Env]:
     if config.train.ppo.reset_at_change and "changed" not in jax.eval_shape(env.reset, jax.random.key(0)).metrics:
         expected = "a task that changes, as nav2d does with env.change_after"
         raise impossible("train.ppo.reset_at_change", f"{config.env.name}, which never does", expected, False)
-    _check_heading(config, source)
-    if config.options.views == "all" and len(source.views) == 1 and not config.options.source:
-        expected = "a body with several equal sides, as ant has"
-        raise impossible("options.views", f"all with {source.name}, which has one", expected, "one")
+    check_sides(config, source)
     if config.options.length > (longest := env.episode_length):
         expected = f"at most the {longest} ticks of an episode of {env.name}"
         raise impossible("options.length", config.options.length, expected, longest)
@@ -67,13 +64,16 @@ def make_envs(config: Config) -> tuple[Env, Env]:
     return env, source
 
 
-def _check_heading(config: Config, source: Env) -> None:
-    """Raise ConfigError if options need a heading that the body lacks."""
+def check_sides(config: Config, source: Env | Body) -> None:
+    """Raise ConfigError if options need a heading, or equal sides, that the body lacks."""
     options = config.options
     for field, value, neutral in (("frame", options.frame, "world"), ("way_weight", options.way_weight, 0)):
         if value != neutral and source.heading is None:
             got = f"{value} with {source.name}, which has none"
             raise impossible(f"options.{field}", got, "a body with a heading, as ant has", neutral)
+    if options.views == "all" and len(source.views) == 1 and not options.source:
+        expected = "a body with several equal sides, as ant has"
+        raise impossible("options.views", f"all with {source.name}, which has one", expected, "one")
 
 
 def _check_actions(config: Config, env: Env, source: Env) -> None:
@@ -119,7 +119,7 @@ def take_over(config: Config, env: Env, source: Env) -> Inherited:
     if not config.options.source:
         for name in config.options.experience:
             if name != COLLECT:
-                gather_experience(Path(name), source, 1)
+                gather_experience(Path(name), source, 1, config.options)
         return Inherited()
     name, flat, policy = config.options.source, None, None
     if config.train.init:

@@ -11,6 +11,7 @@ from jaxtyping import Array
 
 from taic_jax.analysis.evaluate import evaluate
 from taic_jax.artifacts.experience import as_experience
+from taic_jax.artifacts.models import Body
 from taic_jax.config import COLLECT, PRACTISE, Config, OptionsConfig, ReplayConfig, replace, settings_of
 from taic_jax.envs.base import Env
 from taic_jax.networks import PolicyParams
@@ -229,7 +230,7 @@ def agents_of_rows(make: Callable[..., Trainer], rows: Row, states: Any) -> Agen
     return jax.vmap(lambda row, state: make(*row).agent(state))(rows, states)
 
 
-def init_learning(env: Env, config: OptionsConfig, keys: Array) -> LearnState:
+def init_learning(env: Env | Body, config: OptionsConfig, keys: Array) -> LearnState:
     """Return the states [K] before the first gradient step, for configs [K]."""
     networks = make_networks(config, env.proprioceptive_size, env.action_size, env.discrete, env.heading)
     return jax.vmap(lambda config, key: learning.init(config, networks, key))(config, keys)

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-PARTS = ("analysis", "artifacts", "config", "handles", "options", "report", "rl", "runtime", "sweep")
+PARTS = ("analysis", "artifacts", "config", "data", "handles", "options", "report", "rl", "runtime", "sweep")
 FOLDERS = ("envs", "experiments", *(f"taic_jax/{name}" for name in PARTS))
 PACKAGE = sorted((ROOT / "taic_jax").glob("*.py")) + sorted(
     path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py")
@@ -21,6 +21,7 @@ LAYERS = (
     "networks nonfinite",
     "runtime",
     "options",
+    "data",
     "rl",
     "artifacts",
     "analysis",
@@ -28,7 +29,7 @@ LAYERS = (
     "summary sources",
     "pipeline",
     "handles command_line",
-    "run sweep",
+    "run sweep from_data",
     "report",
     "experiments",
     "__main__",

@@ -60,6 +60,8 @@ def test_yaml_names_every_field():
 # YAML keeps no lone surrogates and no control characters.
 ITEMS = {
     "options.experience": st.text(st.characters(exclude_categories=("Cs", "Cc"))),
+    "options.observations": st.text(st.characters(exclude_categories=("Cs", "Cc"))),
+    "options.action_bounds": st.floats(allow_nan=False, allow_infinity=False),
     "train.baselines": st.sampled_from(["flat", "repeat", "total", "transfer"]),
 }
 

@@ -14,9 +14,10 @@ from taic_jax.analysis import measures
 from taic_jax.config import OptionsConfig
 from taic_jax.envs.base import Env, State
 from taic_jax.envs.wrappers import AutoReset
-from taic_jax.options.dataset import Experience, gather, make_dataset
+from taic_jax.options.dataset import Dataset, Experience, Window, gather, make_dataset
 from taic_jax.options.execution import Executor, make_executor
 from taic_jax.options.frame import Frame
+from taic_jax.options.learning import total_loss
 from taic_jax.options.model import OptionModel
 from taic_jax.rl.rollout import rollout, start
 from taic_jax.types import as_arrays
@@ -123,11 +124,48 @@ def encode_windows(
     count: int,
 ) -> WindowCodes:
     """Encode `count` windows of `config.length` ticks, drawn from the selection."""
-    dataset = make_dataset(experience, config)
+    return _encode(model, _draw(config, make_dataset(experience, config), key, count))
+
+
+def _draw(config: OptionsConfig, dataset: Dataset, key: Key[Array, ""], count: int) -> Window:
     drawn = jax.random.randint(key, (count,), 0, dataset.count)
-    windows = gather(dataset, drawn, jnp.full(count, config.length), config.length)
+    return gather(dataset, drawn, jnp.full(count, config.length), config.length)
+
+
+def _encode(model: OptionModel, windows: Window) -> WindowCodes:
     means, log_stds = jax.vmap(model.encode)(windows.actions)
     return WindowCodes(means[:, -1], log_stds[:, -1], windows.actions, windows.states[:, 0], windows.states[:, -1])
+
+
+def measure_windows(
+    config: OptionsConfig, model: OptionModel, dataset: Dataset, key: Key[Array, ""], count: int = 1000
+) -> dict[str, float]:
+    """Measure one seed's option model by `count` windows drawn from a dataset, without an environment.
+
+    Returns:
+      The losses of D, P and F by `window_losses` at the mean codes; `active_dimensions`, `kl` and `window/NAME` as
+      `measure`.
+    """
+    key_windows, key_data = jax.random.split(key)
+    windows = jax.jit(_draw, static_argnames="count")(config, dataset, key_windows, count=count)
+    codes = jax.device_get(jax.jit(_encode)(model, windows))
+    _, losses = jax.jit(total_loss)(model.params, model, config, windows, jnp.zeros(codes.mean.shape))
+    names = "reconstruction_loss", "prediction_loss", "adversarial_loss"
+    return {name: float(losses[name]) for name in names} | _measure_codes(codes, _sample(codes, key_data))
+
+
+def _sample(codes: WindowCodes, key: Key[Array, ""]) -> Array:
+    """Draw a code [N, D] of each window from its q(o|a)."""
+    return codes.mean + jnp.exp(codes.log_std) * jax.random.normal(key, codes.mean.shape)
+
+
+def _measure_codes(codes: WindowCodes, option: Array) -> dict[str, float]:
+    measured = measures.measure_option_space(option, codes.start, codes.end)
+    return {
+        "active_dimensions": float(measures.active_dimensions(codes.mean)),
+        "kl": float(measures.kl_per_dimension(codes.mean, codes.log_std).sum()),
+        **{f"window/{name}": value for name, value in measured.items()},
+    }
 
 
 def measure(
@@ -143,16 +181,11 @@ def measure(
     config = as_arrays(config)
     key_prior, key_windows, key_data, *keys = jax.random.split(key, 7)
     windows = jax.device_get(encode_windows(config, model, experience, key_windows, count))
-    data = windows.mean + jnp.exp(windows.log_std) * jax.random.normal(key_data, windows.mean.shape)
+    data = _sample(windows, key_data)
     prior = jax.random.normal(key_prior, data.shape)
     executor = make_executor(config, model)
     run = jax.jit(partial(execute, env), static_argnames="many")
-    result = {
-        "active_dimensions": float(measures.active_dimensions(windows.mean)),
-        "kl": float(measures.kl_per_dimension(windows.mean, windows.log_std).sum()),
-    }
-    measured = measures.measure_option_space(data, windows.start, windows.end)
-    result |= {f"window/{name}": value for name, value in measured.items()}
+    result = _measure_codes(windows, data)
     cases = [(kind, option, many) for kind, option in (("prior", prior), ("data", data)) for many in (False, True)]
     for (kind, option, many), key_run in zip(cases, keys, strict=True):
         effects = jax.device_get(run(executor, option, key_run, many=many))

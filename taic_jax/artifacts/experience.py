@@ -6,6 +6,7 @@ a resumed one writes the same files again.
 
 import dataclasses
 import zipfile
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,9 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Key
 
-from taic_jax.artifacts.demonstrations import read_demonstrations
 from taic_jax.artifacts.models import Body, check_description
-from taic_jax.config import CollectConfig, experience_ticks, settings_of
+from taic_jax.config import CollectConfig, OptionsConfig, experience_ticks, impossible, settings_of
+from taic_jax.data.read import Recording, as_column, read_recording
 from taic_jax.envs.base import Env
 from taic_jax.options.dataset import Experience
 from taic_jax.options.execution import IdentityExecutor
@@ -28,7 +29,7 @@ from taic_jax.runtime.checkpoint import ArtifactError
 from taic_jax.runtime.files import DESCRIPTION, atomic_file, save_json, writing
 from taic_jax.types import as_arrays
 
-EXPERIENCE = "experience"
+EXPERIENCE, USUAL = "experience", OptionsConfig()
 
 
 def as_experience(ticks: Rollout, proprioceptive_size: int) -> Experience:
@@ -103,17 +104,38 @@ def read_experience(folder: Path, seed: int) -> Experience:
     return jax.tree.map(lambda *parts: np.concatenate(parts), *blocks)
 
 
-def gather_experience(source: Path, env: Env | Body, seeds: int) -> Experience:
-    """Return the experience [K, T, B, ...] of a run, or demonstrations, for the body of `env`, or raise ArtifactError.
+def gather_experience(
+    source: Path,
+    env: Env | Body,
+    seeds: int,
+    config: OptionsConfig = USUAL,
+    say: Callable[[str], object] = lambda line: None,
+) -> Experience:
+    """Return the experience [K, T, B, ...] of a run, or other people's data, for the body of `env`.
 
-    Seed k takes the run's seed k modulo their number; demonstrations are every seed's.
+    Seed k takes the run's seed k modulo their number; data are every seed's. `config` names the arrays of data and
+    their bounds, and `say` gets a line on what was read.
+
+    Raises:
+      ArtifactError: there is none, or it is of another body.
+      ConfigError: the config selects windows by rewards, and the data have none.
     """
     folder = source / EXPERIENCE if (source / EXPERIENCE).is_dir() else source
     if not (folder / DESCRIPTION).is_file():
         if not source.exists() or (source / "config.yaml").is_file():
-            raise ArtifactError(f"{source}: expected a run that collected experience, or demonstrations; got none")
-        demonstrations = read_demonstrations(source, env.proprioceptive_size, env.action_size)
-        return jax.tree.map(lambda x: jnp.broadcast_to(x, (seeds, *x.shape)), demonstrations)
+            raise ArtifactError(f"{source}: expected a run that collected experience, or recorded data; got none")
+        recording = read_recording(source, config.observations, config.actions)
+        recording = recording.fitted(env.proprioceptive_size, env.action_size).scaled(config.action_bounds)
+        say(recording.summary)
+        return of_every_seed(recording, config, seeds)
     description = check_description(folder, "experience", env, {})
     columns = [read_experience(folder, seed % description["seeds"]) for seed in range(seeds)]
     return jax.tree.map(lambda *x: jnp.stack(x), *columns)
+
+
+def of_every_seed(recording: Recording, config: OptionsConfig, seeds: int) -> Experience:
+    """Return recorded data as the experience [K, T, 1, ...] of every seed; ConfigError if the config wants rewards."""
+    if config.select == "top" and not recording.experience.reward.any():
+        raise impossible("options.select", "top", f"random for {recording.path}, which has no rewards", "random")
+    column = as_column(recording.experience)
+    return jax.tree.map(lambda x: jnp.broadcast_to(x, (seeds, *x.shape)), column)

@@ -17,11 +17,12 @@ from taic_jax import __version__
 from taic_jax.artifacts.pretrained import locate
 from taic_jax.config import TAIC, OptionsConfig
 from taic_jax.envs.base import Env, Heading
-from taic_jax.envs.views import one_view
+from taic_jax.envs.views import Views, one_view
 from taic_jax.options.model import OptionModel, Scale, init_params, make_networks
 from taic_jax.runtime.checkpoint import ArtifactError, Tree, checksums, fit_tree, plain_arrays
 from taic_jax.runtime.files import DESCRIPTION, atomic_file, read_description, save_json, writes_here, writing
 
+DATA = "data"  # name of the body of recorded data, and of its task
 OPTIONS, AGENTS, ARRAYS = "options", "agents", "arrays.safetensors"
 FORMAT = 1  # of the two files; a later one is refused
 MODEL = "executor.model."  # begins the names of an option model's arrays among those of agents
@@ -46,19 +47,29 @@ STRUCTURE = (
 EARLIER = {
     "learner": "ppo", "discrete": False, "heading": None, "options.codes": 0, "options.frame": "world",
     "options.way_weight": 0, "options.choose": "code", "sides": 1,
+    "action_bounds": (),
 }  # fmt: skip
 
 
 class Body(NamedTuple):
-    """The environment of an artifact by its description: enough to read the artifact without the environment."""
+    """The environment of an artifact by its description: enough to read the artifact without the environment.
+
+    `action_bounds` are those of recorded data, whose body is `DATA`: see `OptionsConfig`.
+    """
 
     name: str
     proprioception: str
     proprioceptive_size: int
     action_size: int
-    discrete: bool
-    sides: int
-    heading: Heading | None
+    discrete: bool = False
+    sides: int = 1
+    heading: Heading | None = None
+    action_bounds: tuple[float, ...] = ()
+
+    @property
+    def views(self) -> Views:
+        """The one view, in which data are recorded."""
+        return one_view(self.proprioceptive_size, self.action_size)
 
 
 def read_body(folder: Path) -> Body:
@@ -66,7 +77,7 @@ def read_body(folder: Path) -> Body:
     description = EARLIER | (read_description(folder) or {})
     try:
         body = Body(description["env"], *(description[name] for name in Body._fields[1:]))
-        return body._replace(heading=body.heading and Heading(*body.heading))
+        return body._replace(heading=body.heading and Heading(*body.heading), action_bounds=tuple(body.action_bounds))
     except KeyError:
         raise ArtifactError(f"{folder / DESCRIPTION}: expected the description of an artifact, got none") from None
 
@@ -85,9 +96,15 @@ def describe(env: Env | Body) -> dict[str, Any]:
 
 
 def check_description(folder: Path, kind: str, env: Env | Body, fields: dict[str, Any]) -> dict[str, Any]:
-    """Return an artifact's description, or raise ArtifactError where it differs from this body and these fields."""
+    """Return an artifact's description, or raise ArtifactError where it differs from this body and these fields.
+
+    Options that were learnt from recorded data fit every body of their sizes.
+    """
     description = described(folder, kind)
-    body = {name: value for name, value in describe(env).items() if name not in ("env", "sides", "heading")}
+    unchecked = {"env", "sides", "heading"}
+    if description.get("proprioception") == DATA:  # nobody but the user knows whether the entries mean the same
+        unchecked.add("proprioception")
+    body = {name: value for name, value in describe(env).items() if name not in unchecked}
     for name, value in {**body, **fields}.items():
         value = list(value) if isinstance(value, tuple) else value
         if description.get(name) != value:
@@ -139,9 +156,10 @@ def load_artifact(folder: Path, kind: str, like: Tree, prefix: str = "") -> Tree
     return fit_tree(path, arrays, description["taic_jax"], like)
 
 
-def save_options(folder: Path, model: OptionModel, env: Env, config: OptionsConfig) -> None:
+def save_options(folder: Path, model: OptionModel, env: Env | Body, config: OptionsConfig) -> None:
     """Save option models [K] of `env` as the artifact `folder`."""
-    save_artifact(folder, model, describe(env) | structure(config) | {"seeds": len(model.delta)})
+    bounds = {"action_bounds": list(env.action_bounds)} if isinstance(env, Body) else {}
+    save_artifact(folder, model, describe(env) | bounds | structure(config) | {"seeds": len(model.delta)})
 
 
 def load_options(source: str | Path, env: Env | Body, config: OptionsConfig, seeds: int) -> OptionModel:

@@ -82,7 +82,14 @@ class OptionsConfig:
     source: str = ""
     """Run or artifact whose option model is used (--options for short); empty learns one."""
     experience: tuple[str, ...] = ()
-    """Sources to learn from: collect, folders of other runs, demonstrations (.npz, Minari); empty takes collect."""
+    """Sources to learn from: collect, folders of other runs, other people's data; empty takes collect."""
+    observations: tuple[str, ...] = ()
+    """Arrays of other people's data that are joined to observations; empty takes those usual in the format."""
+    actions: str = ""
+    """Array of the actions in such data; empty takes the usual one."""
+    action_bounds: tuple[float, ...] = ()
+    """Bounds of the actions in such data, which become -1 and 1: low and high, or one low an entry and then one high;
+    empty if they are -1 and 1."""
     length: int = 5
     """Ticks of a window and of an option under termination fixed; otherwise the greatest number."""
     size: int = 6

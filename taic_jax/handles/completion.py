@@ -29,7 +29,7 @@ def complete(args: Sequence[str], commands: Iterable[str], later: dict[str, type
     kinds |= {"explore": explore.Command, "export": export.Command}
     presets, cases, every = " ".join(preset_names()), [], set()
     for name, kind in kinds.items():
-        fields = [x.removeprefix("config.") for x in field_types(kind) if x not in ("source", "run", "runs")]
+        fields = [x.removeprefix("config.") for x in field_types(kind) if x not in ("source", "run", "runs", "data")]
         options = [re.sub("_(?=.)", "-", x) for x in fields]
         every.update(options)
         first = presets if name in ("run", "sweep") else ""

@@ -183,12 +183,19 @@ class Scale(struct.PyTreeNode):
         with jax.numpy_rank_promotion("allow"):
             return (x - self.mean) / self.std
 
+    def undo(self, x: Float[Array, "*batch P"]) -> Float[Array, "*batch P"]:
+        """Return what was normalised to x."""
+        with jax.numpy_rank_promotion("allow"):
+            return x * self.std + self.mean
+
 
 class OptionModel(struct.PyTreeNode):
     """E, D, P and F with their parameters, and the scales of states and state changes.
 
     `delta` [] is the error of P at which termination predict ends an option. `book` [M, D] are the codes of discrete
     options, None without `options.codes`. `views` are those of the body if options are chosen by their way.
+    `action_scale` is that of recorded data, in whose units `encode` and `decode` then take and return actions; networks
+    and executors know actions in [-1, 1] alone.
     """
 
     params: dict
@@ -198,6 +205,7 @@ class OptionModel(struct.PyTreeNode):
     networks: Networks = struct.field(pytree_node=False)
     book: Any = None
     views: Any = None
+    action_scale: Any = None
 
     @property
     def state_size(self) -> int:
@@ -228,13 +236,15 @@ class OptionModel(struct.PyTreeNode):
 
     def encode(self, actions: Float[Array, "L A"]) -> tuple[Float[Array, "L D"], Float[Array, "L D"]]:
         """Return mean and log standard deviation of q(o|a_0..a_i) for each i."""
+        actions = self.action_scale(actions) if self.action_scale else actions
         return apply(self.networks.encoder, self.params["encoder"], actions)
 
     def decode(
         self, option: Float[Array, " D"], states: Float[Array, "L P"]
     ) -> tuple[Float[Array, "L A"], Float[Array, " L"]]:
         """Return D's actions and end logits at normalised states; an open-loop D uses only their number."""
-        return apply(self.networks.decoder, self.params["decoder"], option, states)
+        actions, ends = apply(self.networks.decoder, self.params["decoder"], option, states)
+        return (self.action_scale.undo(actions) if self.action_scale else actions), ends
 
     def predict(self, state: Float[Array, " P"], option: Float[Array, " D"]) -> Float[Array, " C"]:
         """Return the normalised change of a normalised state under an option."""
@@ -242,8 +252,7 @@ class OptionModel(struct.PyTreeNode):
 
     def way(self, state: Float[Array, " P"], option: Float[Array, " D"]) -> Float[Array, " 2"]:
         """Return the way in m that P predicts of an option from a normalised state, with a frame that has the way."""
-        predicted = self.predict(state, option)
-        return (predicted * self.change_scale.std + self.change_scale.mean)[-2:]
+        return self.change_scale.undo(self.predict(state, option))[-2:]
 
     def estimate(self, option: Float[Array, " D"]) -> Float[Array, "2 P"]:
         """Return F's estimate of the normalised start and end state."""

@@ -45,7 +45,7 @@ def option_plot(run: LoadedRun, count: int) -> dict[str, Any]:
     model = jax.tree.map(lambda x: x[0], models)
     try:
         sources = [home if name == COLLECT else Path(name) for name in config.experience or (COLLECT,)]
-        columns = [jax.tree.map(lambda x: x[0], gather_experience(source, body, 1)) for source in sources]
+        columns = [jax.tree.map(lambda x: x[0], gather_experience(source, body, 1, config)) for source in sources]
         windows = jax.device_get(encode_windows(as_arrays(config), model, columns, jax.random.key(0), count))
         option, change, drawn, why = windows.mean, windows.end - windows.start, "windows", ""
     except (ArtifactError, OSError) as error:

@@ -87,7 +87,7 @@ def _collect_run(run: LoadedRun, detail: Detail) -> dict[str, Any]:
         "name": run.name, "folder": str(run.folder), "facts": facts_of(run), "notes": list(run.notes),
         "methods": methods_of(run), "histograms": histograms_of(run),
         "stages": [stage_curves(run, stage, detail.points) for stage in run.stages()],
-        "options": option_plot(run, detail.options),
+        "options": option_plot(run, detail.options), "measures": (run.summary or {}).get("options", {}),
         "video": f"data:image/webp;base64,{base64.b64encode(video.read_bytes()).decode()}" if shows else None,
         "config": run.fields,
     }  # fmt: skip

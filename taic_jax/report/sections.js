@@ -70,9 +70,10 @@ function videoFigure(run) {
 readAddress();
 assignColours();
 document.getElementById("main").replaceChildren(...[
-  section("results", "Results", make("p", { class: "lead" }, "Returns of the policy as it explores and of its mean options: interquartile mean over seeds (95 % bootstrap interval). Interactions are per seed."), resultTables()),
+  data.runs.some((run) => run.methods.length) && section("results", "Results", make("p", { class: "lead" }, "Returns of the policy as it explores and of its mean options: interquartile mean over seeds (95 % bootstrap interval). Interactions are per seed."), resultTables()),
   curveSection(),
   gallery("durations", "Durations of options", data.runs.flatMap((run) => run.histograms.map((histogram) => durationFigure(run, histogram)))),
+  measureSection(),
   optionSection(),
   data.sweeps.length > 0 && section("sweeps", "Sweeps", data.sweeps.map(sweepTable)),
   gallery("videos", "Videos", data.runs.filter((run) => run.video).map(videoFigure)),

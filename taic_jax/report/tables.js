@@ -90,6 +90,14 @@ function strip({ return: { per_seed: seeds, iqm, ci95 }, return_untrained: befor
     iqm !== null && draw("line", { class: "mean", x1: toX(iqm), x2: toX(iqm), y1: 4, y2: 22 }));
 }
 
+// Measures of options that were learnt from data alone.
+function measureSection() {
+  const runs = data.runs.filter((run) => Object.keys(run.measures).length);
+  const rows = unique(runs.flatMap((run) => Object.keys(run.measures))).map((name) =>
+    make("tr", {}, rowHead(name), runs.map((run) => cell(twoLines(run.measures[name]), "n"))));
+  return runs.length > 0 && section("measures", "Measures of options", table("Measures of options", ["", ...runs.map((run) => run.name)], rows));
+}
+
 // ---- sweeps
 
 function sweepTable(sweep) {

@@ -6,7 +6,7 @@ import shutil
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, TypedDict
+from typing import Any, NotRequired, TypedDict
 
 import filelock
 
@@ -54,6 +54,7 @@ class Summary(TypedDict):
     seconds: dict[str, float]
     stopped: dict[str, dict[str, dict[str, Any]]]  # stage -> seed -> quantity, after
     methods: dict[str, Method]
+    options: NotRequired[dict[str, Statistics]]  # measures of options that were learnt from data alone
     versions: dict[str, str | None]
     commit: str | None
 

@@ -76,7 +76,7 @@ def test_gathers_what_a_run_collected_for_its_own_body(tmp_path):
         gather_experience(tmp_path, make_env("nav2d"), 1)
 
 
-def test_gathers_demonstrations_for_every_seed(tmp_path):
+def test_gathers_recorded_data_for_every_seed(tmp_path):
     arrays = {"obs": np.zeros((5, 1)), "action": np.full((5, 1), 0.5), "reward": np.arange(5.0)}
     np.savez(tmp_path / "demo.npz", **arrays, done=np.arange(5) == 1)
     gathered = gather_experience(tmp_path / "demo.npz", Counting(100), 2)

@@ -140,7 +140,7 @@ REFUSED = {  # the source, what is there, and two parts of the line
     "run without experience": (
         "options__experience",
         lambda: make_config("a"),
-        "a: expected a run that collected experience, or demonstrations",
+        "a: expected a run that collected experience, or recorded data",
         "got none",
     ),
     "experience of another body": (
