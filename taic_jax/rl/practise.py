@@ -16,6 +16,7 @@ from jaxtyping import Array, Float, Key
 
 from taic_jax.config import OptionsConfig, PractiseConfig, SACConfig
 from taic_jax.envs.base import Env, State
+from taic_jax.envs.orientation import upright
 from taic_jax.envs.wrappers import AutoReset, Wrapper
 from taic_jax.networks import SquashedParams, apply
 from taic_jax.options.model import OptionModel
@@ -129,17 +130,17 @@ class Practising(Wrapper):
         along = velocity @ before.direction
         across = jnp.abs(velocity[0] * before.direction[1] - velocity[1] * before.direction[0])
         at = self.frame.heading.quaternion
-        upright = 1 - 2 * (state[at + 1] ** 2 + state[at + 2] ** 2)
+        level = upright(state[at : at + 4])
         inputs = before.code, model.see(self._state(before, before.inner.obs), first), before.tick, length
         as_learnt = apply(model.networks.decoder, model.params["decoder"], *inputs, method="at")
         grown = jnp.minimum(1.0, 0.5 + before.age.astype(jnp.float32) * config.sac.num_envs / config.ticks)
-        reward = config.upright * grown * upright - config.control_cost * jnp.sum(action**2)
+        reward = config.upright * grown * level - config.control_cost * jnp.sum(action**2)
         reward -= 0.5 * config.kl_weight * jnp.sum(jnp.square(action - as_learnt))
         if config.reward == "direction":
             reward += jnp.minimum(along, config.speed) - 0.5 * across
         else:
             reward += jnp.where(before.tick + 1 >= length, length * information(model, before), 0.0)
-        return reward, dict(zip(METRICS, (along, across, upright), strict=True))
+        return reward, dict(zip(METRICS, (along, across, level), strict=True))
 
 
 def information(model: OptionModel, practice: PracticeState) -> Float[Array, ""]:
