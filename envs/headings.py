@@ -83,7 +83,7 @@ class FreeHeadings(Headings):
     the sector about the x axis that the body's views turn into a circle. The reward of a tick is the speed in m/s along
     it, less half the speed across it and the control cost, plus the upward part of the body's own axis: 1 if it is
     level. Only a robot on its back ends the episode. In half of the episodes a light fence stands around the robot,
-    which it pushes along: who has met nothing falls over the first block.
+    which it pushes along: many that never met anything overturn while they push a block.
 
     Observation: that of `Locomotion`; then, seen from the robot's heading, the direction [2] and the root's horizontal
     velocity [2].

@@ -20,7 +20,6 @@ if TYPE_CHECKING:  # they import JAX, without which the command lines answer
     from taic_jax.runtime.run_folder import Summary
 
 PROGRAM = "taic learn"
-SHORT = ("observations", "actions", "action_bounds")  # fields of options that are options of the command too
 
 
 @dataclass(frozen=True)
@@ -95,7 +94,8 @@ def config_of(command: Command) -> Config:
         raise impossible("--options.experience", command.options.experience, "none, since DATA is the experience")
     if command.action_bounds and command.action_scale == "quantiles":
         raise impossible("--action-bounds", command.action_bounds, "none with --action-scale quantiles")
-    given = {name: value for name in SHORT if (value := getattr(command, name))}
+    short = {"observations": command.observations, "actions": command.actions, "action_bounds": command.action_bounds}
+    given: dict[str, Any] = {name: value for name, value in short.items() if value}
     options = dataclasses.replace(command.options, experience=command.data, **given)
     train = TrainConfig(baselines=())
     config = Config(EnvConfig("data"), options=options, train=train, seed=command.seed, seeds=command.seeds)

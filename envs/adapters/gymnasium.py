@@ -183,7 +183,7 @@ def _robot_of(env: Any, dt: float, obs: Float[np.ndarray, " S"]) -> Locomotion |
     model, data = (getattr(env.unwrapped, name, None) for name in ("model", "data"))
     for name, robot in ROBOTS["gym"].items() if isinstance(model, mujoco.MjModel) else ():
         ours = Locomotion(name, robot, "mujoco")
-        parts = ((getattr(each, part) for each in (model, ours.model)) for part in _BODY.split())
+        parts = ((getattr(each, part) for each in (model, ours.physics.model)) for part in _BODY.split())
         if dt == ours.dt and all(np.shape(one) == np.shape(other) and np.allclose(one, other) for one, other in parts):
             seen = np.concatenate(
                 [data.qpos[robot.num_unobserved :], data.qvel.clip(-robot.velocity_limit, robot.velocity_limit)]

@@ -38,7 +38,7 @@ class EnvConfig:
     """The environment and the engine that runs its physics."""
 
     name: str = "nav2d"
-    """Environment: a task of this package, brax:, playground: or menagerie:NAME, FILE.py:CLASS or MODULE:CLASS."""
+    """Environment: a task of this package, another's (gymnasium:ID, brax:NAME ...), FILE.py:CLASS or MODULE:CLASS."""
     backend: Literal["auto", "mujoco", "mjx", "warp"] = "auto"
     """Physics engine; auto takes mujoco (C, all cores) on CPU and mjx (JAX) elsewhere."""
     num_threads: Natural = 0
