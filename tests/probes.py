@@ -137,6 +137,7 @@ class Repeat(struct.PyTreeNode):
     option_size: int = struct.field(pytree_node=False, default=1)
     noise_size: int = struct.field(pytree_node=False, default=0)
     discrete: bool = struct.field(pytree_node=False, default=False)
+    at_once: int = struct.field(pytree_node=False, default=0)
 
     def start(self, option: Array, obs: Array) -> Array:
         """Carry the action."""

@@ -38,6 +38,11 @@ class Executor(Protocol):
         """X, the standard normal numbers that `act` and `ended` share each tick."""
         ...
 
+    @property
+    def at_once(self) -> int:
+        """The environments in which options begin together, since `start` is costly; 0 for all."""
+        ...
+
     def start(self, option: Float[Array, " D"], obs: Float[Array, " S"]) -> Any:
         """Return the carry of an option that begins at this observation."""
         ...
@@ -58,6 +63,7 @@ class IdentityExecutor(struct.PyTreeNode):
     length: int = struct.field(pytree_node=False, default=1)
     discrete: bool = struct.field(pytree_node=False, default=False)
     noise_size: int = struct.field(pytree_node=False, default=0)
+    at_once: int = struct.field(pytree_node=False, default=0)
 
     def start(self, option: Float[Array, " A"], obs: Float[Array, " S"]) -> Float[Array, " A"]:
         """Carry the action itself."""
@@ -113,6 +119,11 @@ class OptionExecutor(struct.PyTreeNode):
     def noise_size(self) -> int:
         """X, the standard normal numbers of a tick: those of the termination rule, then any one per action."""
         return self.termination.noise_size + (0 if self.std is None else self.model.networks.decoder.action_size)
+
+    @property
+    def at_once(self) -> int:
+        """A choice by way takes hundreds of P's predictions."""
+        return 8 if self.by_way else 0
 
     def code(self, option: Float[Array, "*batch M"]) -> Float[Array, "*batch D"]:
         """Return the codes of options that are not chosen by their way."""

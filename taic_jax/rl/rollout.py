@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Bool, Float, Key
 
 from taic_jax.envs.base import Env, State
 from taic_jax.options.execution import Executor
@@ -85,8 +85,7 @@ def _tick(
     obs, decision = running.env.obs, running.ended
     chance = noise[:, executor.option_size :]
     option, log_prob = decide(obs, noise[:, : executor.option_size])
-    fresh = jax.vmap(executor.start)(option, obs)
-    carry, action = jax.vmap(executor.act)(select(decision, fresh, running.option), obs, chance)
+    carry, action = jax.vmap(executor.act)(_begin(executor, decision, option, obs, running.option), obs, chance)
     state: Any = jax.vmap(env.step)(running.env, action)
     done = state.terminated | state.truncated
     duration = jnp.where(decision, 0, running.duration) + 1
@@ -100,6 +99,27 @@ def _tick(
     )  # fmt: skip
     last_return = jnp.where(done, total, running.last_return)
     return RolloutCarry(state, carry, duration, ended, jnp.where(done, 0.0, total), last_return), tick
+
+
+def _begin(
+    executor: Executor, decision: Bool[Array, " B"], option: Float[Array, "B D"], obs: Float[Array, "B S"], running: Any
+) -> Any:
+    """Return the running options, with new ones where an environment decides.
+
+    If `start` is costly, a few environments begin at a time, in as many rounds as there are decisions: most ticks have
+    few of these.
+    """
+    few = min(executor.at_once, len(decision))
+    if not few:
+        return select(decision, jax.vmap(executor.start)(option, obs), running)
+    order = jnp.argsort(~decision)
+
+    def begin(index: Any, options: Any) -> Any:
+        rows = jax.lax.dynamic_slice_in_dim(order, index * few, few)
+        fresh, old = jax.vmap(executor.start)(option[rows], obs[rows]), jax.tree.map(lambda x: x[rows], options)
+        return jax.tree.map(lambda x, y: x.at[rows].set(y), options, select(decision[rows], fresh, old))
+
+    return jax.lax.fori_loop(0, -(-jnp.sum(decision) // few), begin, running)
 
 
 def nothing(state: State) -> None:

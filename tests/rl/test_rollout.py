@@ -130,6 +130,16 @@ def test_two_rollouts_equal_one():
     assert not parts[1].decision[0].all()
 
 
+@pytest.mark.parametrize("at_once", [1, 3, 9])
+def test_options_that_begin_a_few_environments_at_a_time_are_those_that_begin_together(at_once):
+    env = Counting(END, spread=5)
+    runs = [run(env, Repeat(N, noise_size=1, at_once=few), draw, 200) for few in (0, at_once)]
+    (running, (ticks,)), (few_running, (few_ticks,)) = runs
+    assert set(ticks.decision.sum(axis=1)) == set(range(B + 1))  # from no decision in a tick to all
+    assert_trees_equal(running, few_running)
+    assert_trees_equal(ticks, few_ticks)
+
+
 def test_flat_control_decides_at_every_tick_and_takes_one_step_in_each():
     running, (ticks,) = run(Counting(), IdentityExecutor(1), draw, 9)
     assert ticks.decision.all() and ticks.ended.all() and ticks.reward.shape == (9, B)
