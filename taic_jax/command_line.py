@@ -66,7 +66,7 @@ class Command:
     version: tyro.conf.FlagCreatePairsOff[bool] = False
     """Print the version and stop."""
     checkpoint_seconds: float = 30.0
-    """Least seconds between two checkpoints of a stage; 0 writes one every iteration."""
+    """Least seconds between two checkpoints of a stage, more if they are large; 0 writes one every iteration."""
     shard: Shard = "auto"
     """Split over devices (accelerators, or the cores of a CPU): the seeds of all points, or the environments of each
     seed; auto splits the seeds where there are several."""

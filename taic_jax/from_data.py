@@ -49,7 +49,7 @@ class Command:
     quiet: tyro.conf.FlagCreatePairsOff[bool] = False
     """Show neither progress nor the table at the end, only the path of the results."""
     checkpoint_seconds: float = 30.0
-    """Least seconds between two checkpoints; 0 writes one at each log line."""
+    """Least seconds between two checkpoints, more if they are large; 0 writes one at each log line."""
     options: Annotated[OptionsConfig, tyro.conf.FlagConversionOff] = OptionsConfig(select="random")
 
 

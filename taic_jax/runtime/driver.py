@@ -37,6 +37,7 @@ STAGE_STREAMS = {
 # The stages whose results a stage starts from: a seed that stopped there stays stopped.
 BUILDS_ON = {"learn": ("collect",), "practise": ("collect", "learn"), "train": ("collect", "learn", "practise")}
 CHECKPOINT_SECONDS = 30.0
+PER_SAVE = 40  # Seconds between checkpoints for each that a save holds the run up; as many pass beside it.
 DUMPS = "dumps"
 
 
@@ -227,7 +228,7 @@ def drive(
         return guard.state
     guard, args = run.devices.place((guard, args))
     compiled = run.compile(stage, guarded(step), guard, *args, donate=True)
-    saved = time.perf_counter()
+    saved, pause = time.perf_counter(), run.checkpoint_seconds
     with checkpoints.waited_for(), run.logger.doing(stage, num_steps * unit, done=first * unit):
         for index in range(first, num_steps):
             guard, metrics, extra = compiled(guard, *args)
@@ -238,10 +239,12 @@ def drive(
             run.clock.ticks += ticks
             if changed := bool((new_codes != codes).any()):
                 codes = run.record_divergence(stage, run.rows(guard), unit, before=codes)
-            due = changed or index + 1 == num_steps or time.perf_counter() - saved > run.checkpoint_seconds
+            due = changed or index + 1 == num_steps or time.perf_counter() - saved > pause
             due, received = agree([due, run.signals.received or 0])
             if due or received:
+                began = time.perf_counter()
                 checkpoints.save(index + 1, run.rows(guard))
+                pause = run.checkpoint_seconds and max(run.checkpoint_seconds, PER_SAVE * (time.perf_counter() - began))
                 saved = run.clock.add(saved, run.folder.clock_path)
             if received:
                 raise Interrupted(received)
