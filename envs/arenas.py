@@ -204,7 +204,7 @@ def _add_movable(
 def _add_camera(spec: mujoco.MjSpec, arena: Arena) -> None:
     """Add a camera above the whole room, tilted a little so that heights are visible."""
     x_low, y_low, x_high, y_high = arena.room
-    tilt, away = np.deg2rad(25), 1.35 * max(y_high - y_low, 0.8 * (x_high - x_low))
+    tilt, away = np.deg2rad(17), 1.35 * max(y_high - y_low, 0.8 * (x_high - x_low))
     pos = ((x_low + x_high) / 2, (y_low + y_high) / 2 - away * np.sin(tilt), arena.ground + away * np.cos(tilt))
     camera = spec.worldbody.add_camera(name="arena", pos=pos)
     camera.alt.type = mujoco.mjtOrientation.mjORIENTATION_XYAXES

@@ -42,7 +42,7 @@ MANY = {"num_envs": 64, "rollout_length": 250}
 CARRIED = STEERING | {"train.ppo.learning_rate": 6e-4, "train.ppo.minibatch_size": 64}
 CARRIED |= {f"train.ppo.{field}": value for field, value in MANY.items()}
 PPO_IN_ARENAS = {f"collect.ppo.{field}": value for field, value in MANY.items()} | {"collect.ppo.gamma": 0.999}
-ARENA = {"env.goal": "uniform", "collect.env": "", "collect.learner": "ppo", "practise.ticks": 0} | PPO_IN_ARENAS
+ARENA = {"env.goal": "mixed", "collect.env": "", "collect.learner": "ppo", "practise.ticks": 0} | PPO_IN_ARENAS
 ARENA |= {"options.source": "pretrained:steering", "env.contacts": "feet"}
 TICKS = {"collect.ticks": 1_000_000, "train.ticks": 1_000_000, "train.baselines": ("flat",), "train.learner": "sac"}
 
@@ -58,7 +58,6 @@ def test_the_preset_of_turning_differs_from_ant_in_what_the_task_asks_for():
 def test_presets_of_the_arenas_differ_from_steering_in_task_and_learner(task):
     preset = dict(walk(load_config(f"transfer_{task}")))
     expected = dict(walk(load_config("steering"))) | ARENA | TICKS | {"env.name": task}
-    expected["env.goal"] = "uniform" if task == "ant_maze" else "mixed"
     expected["train.ticks"] = {"ant_maze": 1_000_000, "ant_push": 2_000_000, "ant_fall": 3_000_000}[task]
     differing = {name for name in expected if preset[name] != expected[name]}
     assert all(name.startswith("train.sac.") for name in differing) and preset["train.sac.relabel"] == 4
