@@ -117,11 +117,13 @@ def tell(work: Callable[[], int | None]) -> int:
     except BrokenPipeError:  # a reader such as head has closed the pipe
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
-    except (ValueError, OSError) as error:
-        ours = type(error).__module__.partition(".")[0] == "taic_jax"
+    except (ValueError, OSError, RuntimeError) as error:
+        # JAX raises an error of its own for one that an environment on the host raised in a program.
+        _, from_host, reason = str(error).partition("AdapterError: ")
+        ours = from_host or type(error).__module__.partition(".")[0] == "taic_jax"
         if not ours and getattr(error, "filename", None) is None:  # not about a file either: a bug
             raise
-        return _fail(2, str(error))
+        return _fail(2, reason or str(error))
 
 
 def attempt(work: Callable[[Signals], object], run_dir: Path) -> int:

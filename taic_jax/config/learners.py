@@ -100,6 +100,8 @@ class SACConfig(ReplayConfig):
     """Initial temperature, the weight of the entropy, which is learnt."""
     target_entropy: Annotated[float, Bounds(-math.inf)] = -1.0
     """Entropy of the policy that the temperature is learnt for, per dimension, of options in units of their bound."""
+    pessimism: Share = 1.0
+    """The lower of both critics' values counts at 1, their mean at 0: over a long discount the gap adds up."""
     prior_weight: float = 0.0
     """Weight of the KL divergence of the policy from N(0, I), in place of temperature and entropy; 0 for these."""
 

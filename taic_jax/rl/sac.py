@@ -1,7 +1,7 @@
 """Soft actor-critic over options (§5): its networks, its losses, its gradient step; flat with the identity executor.
 
 A decision is judged by its semi-Markov target r_{t..t+k} + gamma^k V(s_{t+k}), in which
-V(s) = min Q(s, o) - temperature log pi(o|s) for an option o drawn from pi.
+V(s) = min Q(s, o) - temperature log pi(o|s) for an option o drawn from pi, and min is of two critics.
 """
 
 from functools import partial
@@ -78,7 +78,7 @@ def sac_loss(
     values = networks.values(critics, batch.obs, batch.option / bound)
     critic_loss = jnp.sum(jnp.mean(jnp.square(values - target[None]), axis=1))
     option, log_prob = policy.draw(learnt.policy.replace(actor=actor), batch.obs, 1.0, noise[1])
-    value = jnp.min(networks.values(jax.lax.stop_gradient(critics), batch.obs, option / bound), axis=0)
+    value = both(config, networks.values(jax.lax.stop_gradient(critics), batch.obs, option / bound))
     actor_loss = jnp.mean(cost(config, bound, temperature, option, log_prob) - value)
     entropy = -jax.lax.stop_gradient(jnp.mean(log_prob))
     temperature_loss = log_temperature * (entropy - config.target_entropy * executor.option_size)
@@ -98,8 +98,14 @@ def semi_markov_target(
     """Return r_{t..t+k} + gamma^k V(s_{t+k}) with the target critics; an end of the task has no V."""
     option, log_prob = policy.draw(learnt.policy, batch.next_obs, 1.0, noise)
     values = networks.values(learnt.targets, batch.next_obs, option / learnt.policy.bound)
-    value = jnp.min(values, axis=0) - cost(config, learnt.policy.bound, temperature, option, log_prob)
+    value = both(config, values) - cost(config, learnt.policy.bound, temperature, option, log_prob)
     return batch.reward + batch.discount * value
+
+
+def both(config: SACConfig, values: Float[Array, "2 M"]) -> Float[Array, " M"]:
+    """Return the value that two critics together give: between the lower, with a pessimism of 1, and the mean."""
+    low = jnp.min(values, axis=0)
+    return low + (1.0 - config.pessimism) * (jnp.mean(values, axis=0) - low)
 
 
 def cost(

@@ -56,11 +56,17 @@ def learnt():
     return config, policy, critics, sac.Learnt(*values, None), batch, draw(rng, 2, M, D)
 
 
-def test_the_target_is_semi_markov_and_the_gradients_of_the_three_losses_do_not_mix(learnt):
+@pytest.mark.parametrize("pessimism", [1.0, 0.25])
+def test_the_target_is_semi_markov_and_the_gradients_of_the_three_losses_do_not_mix(learnt, pessimism):
     config, policy, critics, learnt, batch, noise = learnt
+    config = as_arrays(dataclasses.replace(config, pessimism=pessimism))
+
+    def both(values):
+        return pessimism * values.min(axis=0) + (1 - pessimism) * values.mean(axis=0)
+
     target = sac.semi_markov_target(config, policy, critics, learnt, 0.5, batch, noise[0])
     option, log_prob = policy.draw(learnt.policy, batch.next_obs, 1.0, noise[0])
-    value = critics.values(learnt.targets, batch.next_obs, option / 3).min(axis=0) - 0.5 * log_prob
+    value = both(critics.values(learnt.targets, batch.next_obs, option / 3)) - 0.5 * log_prob
     np.testing.assert_allclose(target, batch.reward + batch.discount * value, rtol=1e-4)
 
     def critic_loss(params):
@@ -69,7 +75,7 @@ def test_the_target_is_semi_markov_and_the_gradients_of_the_three_losses_do_not_
 
     def actor_loss(actor):
         option, log_prob = policy.draw(learnt.policy.replace(actor=actor), batch.obs, 1.0, noise[1])
-        return jnp.mean(0.5 * log_prob - critics.values(learnt.critics, batch.obs, option / 3).min(axis=0))
+        return jnp.mean(0.5 * log_prob - both(critics.values(learnt.critics, batch.obs, option / 3)))
 
     params = learnt.policy.actor, learnt.critics, learnt.log_temperature
     got, terms = jax.grad(sac.sac_loss, has_aux=True)(params, config, Repeat(3, D), learnt, batch, noise)
