@@ -58,7 +58,7 @@ def test_the_preset_of_turning_differs_from_ant_in_what_the_task_asks_for():
 def test_presets_of_the_arenas_differ_from_steering_in_task_and_learner(task):
     preset = dict(walk(load_config(f"transfer_{task}")))
     expected = dict(walk(load_config("steering"))) | ARENA | TICKS | {"env.name": task}
-    expected["train.ticks"] = {"ant_maze": 1_000_000, "ant_push": 2_000_000, "ant_fall": 3_000_000}[task]
+    expected["train.ticks"] = {"ant_maze": 1_000_000, "ant_push": 2_000_000, "ant_fall": 2_000_000}[task]
     differing = {name for name in expected if preset[name] != expected[name]}
     assert all(name.startswith("train.sac.") for name in differing) and preset["train.sac.relabel"] == 4
 

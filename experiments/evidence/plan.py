@@ -14,7 +14,7 @@ ROBOTS = ("half_cheetah", "ant", "hopper", "walker2d")
 TURN, ARENAS = "ant_turn", ("ant_maze", "ant_push", "ant_fall")
 RECOVERY = "nav2d"
 # Interactions with the task; flat PPO of method long has twice as many.
-TICKS = {"ant": 2_000_000, TURN: 3_000_000, "ant_maze": 1_000_000, "ant_push": 2_000_000, "ant_fall": 3_000_000}
+TICKS = {"ant": 2_000_000, TURN: 3_000_000, "ant_maze": 1_000_000, "ant_push": 2_000_000, "ant_fall": 2_000_000}
 MILLION = 1_000_000
 CAPACITY = MILLION  # Ticks of experience; of Ant's two million the second half, which has all its windows.
 FIRST_SEED = 200
