@@ -206,9 +206,8 @@ def drive(
 
     Args:
       run: the run; its `stopped` receives the codes.
-      step: (states [K], *args) -> (states, metrics [K] with the codes `nonfinite`, input of `after`).
+      step: (states [K], *args: constant) -> (states, metrics [K] with the codes `nonfinite`, input of `after`).
       state: before the first step; consumed.
-      *args: constant arrays.
       unit: ticks per seed, or gradient steps, of a step in the logs.
       ticks: interactions of a step over all seeds.
       after: called with the step's index and the third result.
