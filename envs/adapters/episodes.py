@@ -58,13 +58,12 @@ class Episodes:
 
         self._each(one, before, wanted != 0, seeds, after, wanted, seeds)
 
-    def step(self, sent: Sent, after: Returned) -> None:
-        """Make a tick: rows of seed, name, obs [S], tick, action [A], and all actions before [T, A]; to name, obs,
+    def step(self, sent: Sent, past: Float[np.ndarray, "*batch T A"], after: Returned) -> None:
+        """Make a tick: rows of seed, name, obs [S], tick and action [A], beside all actions before; to name, obs,
         reward, terminated, truncated and metrics."""
         sent, size = sent.reshape(-1, sent.shape[-1]), WORDS + self.obs.size
-        places = np.cumsum([WORDS, WORDS, self.obs.size, 1, self.action_size])
-        seeds, names, obs, ticks, actions, past = np.split(sent, places, axis=1)
-        after = after.reshape(-1, after.shape[-1])
+        seeds, names, obs, ticks, actions = np.split(sent, np.cumsum([WORDS, WORDS, self.obs.size, 1]), axis=1)
+        past, after = past.reshape(-1, *past.shape[-2:]), after.reshape(-1, after.shape[-1])
         after[:, :WORDS] = following(names, actions)
 
         def one(env: Any, ready: bool, result: np.ndarray, control: np.ndarray, *episode: np.ndarray) -> None:
@@ -74,12 +73,23 @@ class Episodes:
             result[WORDS:size] = flat(obs)
             result[size:] = *outcome, *[info.get(key, 0.0) for key in self.metrics]
 
-        self._each(one, names, True, after[:, :WORDS], after, self._controls(actions), seeds, obs, ticks, past)
+        self._each(
+            one,
+            names,
+            True,
+            after[:, :WORDS],
+            after,
+            self._controls(actions),
+            seeds,
+            obs,
+            ticks,
+            past.reshape(-1, *past.shape[-2:]),
+        )
 
     def _repeat(self, env: Any, seed: np.ndarray, obs: np.ndarray, tick: np.ndarray, past: np.ndarray) -> None:
         """Repeat the ticks of an episode, or raise `AdapterError` at another last observation."""
         count = int(tick[0])
-        repeated, _ = self.play(env, as_seed(seed), past.reshape(-1, self.action_size)[:count])
+        repeated, _ = self.play(env, as_seed(seed), past[:count])
         if not np.array_equal(repeated, obs, equal_nan=True):
             problem = f"tick {count} of an episode, repeated, has another observation"
             raise AdapterError(f"{self._name}: {problem}: a run in it cannot be resumed")

@@ -91,9 +91,9 @@ class GymnasiumEnv(Env):
         """Step by Gymnasium."""
         now, episodes = state.physics, self._episodes
         tick = now.tick.astype(jnp.float32)[None]
-        sent = jnp.concatenate([now.seed, now.name, now.obs, tick, action, now.actions.ravel()])
+        sent = jnp.concatenate([now.seed, now.name, now.obs, tick, action])
         sizes = WORDS, now.obs.size, 1, 1, 1, len(episodes.metrics)
-        after = self._step(sent, sum(sizes))
+        after = self._step(sent, now.actions, size=sum(sizes))
         name, obs, reward, terminated, truncated, metrics = jnp.split(after, np.cumsum(sizes)[:-1])
         actions = now.actions.at[now.tick].set(action)
         return state.replace(
@@ -120,7 +120,7 @@ class GymnasiumEnv(Env):
 
     def _begin(self, key: Key[Array, ""], wanted: Array, before: Array, actions: Array) -> State:
         seed = jax.random.bits(key, (WORDS,), jnp.uint16).astype(jnp.float32)
-        obs = self._start(jnp.concatenate([wanted, seed, before]), self.observation_size)
+        obs = self._start(jnp.concatenate([wanted, seed, before]), size=self.observation_size)
         physics = GymnasiumPhysics(seed, seed, obs, jnp.zeros((), jnp.int32), actions)
         return State.first(physics, obs, dict.fromkeys(self._episodes.metrics, jnp.zeros(())))
 

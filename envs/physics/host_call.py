@@ -18,12 +18,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-HostFn = Callable[[np.ndarray, np.ndarray], None]
-"""A function that reads its first argument and writes its second; both are float32 and XLA's own memory."""
+HostFn = Callable[..., None]
+"""A function that reads its arguments but the last, and writes that one; all are float32 and XLA's own memory."""
 API_VERSION = (0, 1)  # Of XLA's interface with the places below: major and minor. 0.3 still has them; XLA serves both.
 
 # Places of words in XLA_FFI_CallFrame, XLA_FFI_Api, XLA_FFI_Extension_Base, XLA_FFI_Metadata and XLA_FFI_Buffer.
-_EXTENSION, _API, _ARGUMENTS, _RESULTS = 1, 2, 9, 14
+_EXTENSION, _API, _NUM_ARGUMENTS, _ARGUMENTS, _RESULTS = 1, 2, 7, 9, 14
 _CREATE_ERROR = 6
 _EXTENSION_TYPE, _EXTENDED, _METADATA_VERSION = 1, 3, 3
 _DATA, _RANK, _DIMS = 3, 4, 5
@@ -50,10 +50,10 @@ class HostCall:
         self._handler = _Handler(self._handle)
         jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(self._handler), platform="cpu")
 
-    def __call__(self, argument: Float[Array, "*batch n"], size: int) -> Float[Array, "*batch {size}"]:
-        """Call the function within a program; axes added by `vmap` lead in both arrays."""
-        shape = jax.ShapeDtypeStruct((*argument.shape[:-1], size), jnp.float32)
-        return jax.ffi.ffi_call(self.name, shape, vmap_method="broadcast_all")(argument)
+    def __call__(self, *arguments: Float[Array, "..."], size: int) -> Float[Array, "*batch {size}"]:
+        """Call the function within a program; axes added by `vmap` lead in all arrays, which are not copied."""
+        shape = jax.ShapeDtypeStruct((*arguments[0].shape[:-1], size), jnp.float32)
+        return jax.ffi.ffi_call(self.name, shape, vmap_method="broadcast_all")(*arguments)
 
     def _handle(self, address: int) -> int | None:
         frame = _words(address, _RESULTS + 1)
@@ -64,7 +64,8 @@ class HostCall:
                 _words(extension[_EXTENDED], _METADATA_VERSION + 1)[_METADATA_VERSION] = major | minor << 32
                 return None
         try:
-            self._function(_array(frame[_ARGUMENTS]), _array(frame[_RESULTS]))
+            arguments = _words(frame[_ARGUMENTS], frame[_NUM_ARGUMENTS])
+            self._function(*map(_array, arguments), _array(*_words(frame[_RESULTS], 1)))
         except Exception as error:  # raised here it would only be printed
             return _as_error(frame[_API], f"{type(error).__name__}: {error}")
         return None
@@ -81,16 +82,16 @@ class HostFunction(HostCall):
         if host_calls_work():
             super().__init__(name, function)
 
-    def __call__(self, argument: Float[Array, "*batch n"], size: int) -> Float[Array, "*batch {size}"]:
+    def __call__(self, *arguments: Float[Array, "..."], size: int) -> Float[Array, "*batch {size}"]:
         shape = jax.ShapeDtypeStruct((size,), jnp.float32)
         copied = functools.partial(self._copied, size)
         elsewhere = functools.partial(jax.pure_callback, copied, shape, vmap_method="broadcast_all")
         here = functools.partial(super().__call__, size=size) if host_calls_work() else elsewhere
-        return jax.lax.platform_dependent(argument, cpu=here, default=elsewhere)
+        return jax.lax.platform_dependent(*arguments, cpu=here, default=elsewhere)
 
-    def _copied(self, size: int, argument: Array) -> np.ndarray:
-        result = np.empty((*argument.shape[:-1], size), np.float32)
-        self._function(np.asarray(argument), result)
+    def _copied(self, size: int, *arguments: Array) -> np.ndarray:
+        result = np.empty((*arguments[0].shape[:-1], size), np.float32)
+        self._function(*map(np.asarray, arguments), result)
         return result
 
 
@@ -112,11 +113,11 @@ def host_calls_work() -> bool:
         cpu, *_ = jax.local_devices(backend="cpu")
     except RuntimeError:  # without a CPU device no program asks for host calls
         return False
-    argument = np.arange(6, dtype=np.float32).reshape(2, 3)
+    argument, one = np.arange(6, dtype=np.float32).reshape(2, 3), np.ones((2, 1), np.float32)
     try:
         with jax.ensure_compile_time_eval(), jax.default_device(cpu):
             call = jax.jit(functools.partial(HostCall("taic_jax_probe", _answer), size=2))
-            if np.array_equal(call(argument), [[1, 3], [7, 9]]) and _fails(call, np.full_like(argument, -1)):
+            if np.array_equal(call(argument, one), [[1, 3], [7, 9]]) and _fails(call, argument, -one):
                 return True
         reason = "a call of known answer went wrong"
     except (RuntimeError, ValueError) as error:
@@ -129,16 +130,16 @@ def host_calls_work() -> bool:
     return False
 
 
-def _answer(argument: np.ndarray, result: np.ndarray) -> None:
-    """Return twice the first two of three columns, plus one; refuse negative numbers."""
-    if argument.shape != (2, 3) or argument.min() < 0:
+def _answer(argument: np.ndarray, one: np.ndarray, result: np.ndarray) -> None:
+    """Return twice the first two of three columns, plus one; refuse a negative one."""
+    if (argument.shape, one.shape) != ((2, 3), (2, 1)) or one.min() < 0:
         raise ValueError(_REFUSAL)
-    result[...] = 2 * argument[:, :2] + 1
+    result[...] = 2 * argument[:, :2] + one
 
 
-def _fails(call: Callable[[np.ndarray], jax.Array], argument: np.ndarray) -> bool:
+def _fails(call: Callable[..., jax.Array], *arguments: np.ndarray) -> bool:
     try:
-        jax.block_until_ready(call(argument))
+        jax.block_until_ready(call(*arguments))
     except Exception as error:  # its type differs between versions of JAX
         return _REFUSAL in str(error)
     return False
@@ -148,9 +149,9 @@ def _words(address: int, count: int) -> "ctypes.Array[ctypes.c_int64]":
     return (ctypes.c_int64 * count).from_address(address)
 
 
-def _array(buffers: int) -> np.ndarray:
-    """Return the first of the buffers as an array, not copied."""
-    buffer = _words(_words(buffers, 1)[0], _DIMS + 1)
+def _array(address: int) -> np.ndarray:
+    """Return a buffer as an array, not copied."""
+    buffer = _words(address, _DIMS + 1)
     shape = tuple(_words(buffer[_DIMS], buffer[_RANK]))
     return np.ndarray(shape, np.float32, (ctypes.c_char * (4 * math.prod(shape))).from_address(buffer[_DATA]))
 

@@ -52,7 +52,7 @@ class MujocoPhysics(Physics):
         model = self.model
         act = [] if state.act is None else [state.act]
         sent = jnp.concatenate([state.qpos, state.qvel, *act, state.qacc_warmstart, ctrl])
-        after = self.engine.call(sent, self.engine.num_returned)
+        after = self.engine.call(sent, size=self.engine.num_returned)
         ends = np.cumsum([model.nq, model.nv, model.na, model.nv])
         qpos, qvel, act, warmstart, sensordata = jnp.split(after, ends)
         read = {"act": act if model.na else None, "sensordata": sensordata if self.sensors else None}

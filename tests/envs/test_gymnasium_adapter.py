@@ -168,9 +168,8 @@ def test_rows_of_seeds_are_one_call_and_only_ended_episodes_are_reset(monkeypatc
     """Two seeds of three environments: a call a tick, and a reset for each episode alone."""
     env, sizes, step = AutoReset(make_env("gymnasium:Walk-v0")), [], Episodes.step
     host = env.env.env._step
-    monkeypatch.setattr(
-        host, "_function", lambda sent, after: (sizes.append(sent.shape[:-1]), step(env.env.env._episodes, sent, after))
-    )
+    counted = lambda sent, *more: (sizes.append(sent.shape[:-1]), step(env.env.env._episodes, sent, *more))  # noqa: E731
+    monkeypatch.setattr(host, "_function", counted)
     keys = jax.random.split(jax.random.key(0), (2, 3))
     actions = jnp.broadcast_to(jnp.linspace(-1.0, 1.0, 6).reshape(2, 3, 1), (8, 2, 3, 2))
     step_all, Walk.resets = jax.vmap(jax.vmap(env.step)), 0

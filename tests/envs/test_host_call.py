@@ -26,7 +26,8 @@ print("ffi_call" in str(jax.make_jaxpr(program)(states)), program(states).tolist
 CHANGES = {
     "as it is": ("", None),
     "an XLA of another version": ("host_call.API_VERSION = (1, 0)", "handler's API version (1.0) is incompatible"),
-    "another layout of results": ("host_call._answer = lambda argument, result: None", "known answer went wrong"),
+    "another layout of results": ("host_call._answer = lambda argument, one, result: None", "known answer went wrong"),
+    "another layout of arguments": ("host_call._NUM_ARGUMENTS = 6", "missing 2 required positional arguments"),
     "errors that get lost": ("host_call._as_error = lambda api, message: None", "known answer went wrong"),
 }
 
