@@ -7,7 +7,7 @@ Writes a row per run and measure, see `navigate`; a picture shows the codes and 
 
 import dataclasses
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from taic_jax.command_line import tell
 from taic_jax.config import Config, ConfigError
 from taic_jax.envs import make_env
 from taic_jax.envs.base import Env
+from taic_jax.envs.menagerie import MENAGERIE_PREFIX
 from taic_jax.experiments.evidence.navigate import (
     measure_codes,
     measures_of,
@@ -41,10 +42,10 @@ from taic_jax.types import as_arrays
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
-    """Lead ants through the arenas by the options of runs."""
+    """Lead robots through the arenas by the options of runs."""
 
     runs: tyro.conf.Positional[tuple[Path, ...]]
-    """Folders of finished runs with options of the ant."""
+    """Folders of finished runs with options of the ant, or of a robot of MuJoCo Menagerie."""
     out: Path = Path("ways.csv")  # The table of numbers.
     picture: Path | None = None  # Of the navigated ways.
 
@@ -62,13 +63,20 @@ def executors_of(folder: Path) -> tuple[Config, Env, list[OptionExecutor]]:
     return config, env, [make_executor(as_arrays(config.options), model) for model in rows]
 
 
+def ground_and_arenas(config: Config, env: Env) -> tuple[Env, dict[str, Any]]:
+    """Return the open ground of the run's robot, and the arenas there are for it, by name."""
+    backend, body, robot = config.env.backend, config.env.body, env.proprioception
+    if robot.startswith(MENAGERIE_PREFIX):
+        return make_env(robot, backend), {f"{robot}_maze": make_env(f"{robot}_maze", backend)}
+    arenas = {name: make_env(name, backend, body=body) for name in ARENAS}
+    return make_env("ant", backend, body=body, contacts="body"), arenas
+
+
 def navigation_of(folder: Path, picture: Path | None = None) -> dict[str, np.ndarray]:
-    """Return of every seed [K] of a run the measures of codes, `codes/NAME`, and of the ants that a navigator leads by
-    them, `ARENA/NAME`; draw the first seed."""
-    config, _, executors = executors_of(folder)
-    body = config.env.body
-    ground = make_env("ant", config.env.backend, body=body, contacts="body")
-    arenas: dict[str, Any] = {name: make_env(name, config.env.backend, body=body) for name in ARENAS}
+    """Return of every seed [K] of a run the measures of codes, `codes/NAME`, and of the robots that a navigator leads
+    by them, `ARENA/NAME`; draw the first seed."""
+    config, source, executors = executors_of(folder)
+    ground, arenas = ground_and_arenas(config, source)
     rows = []
     for seed, executor in enumerate(executors):
         key_codes, key_run, key_order = jax.random.split(jax.random.key(config.seed + seed), 3)
@@ -93,27 +101,27 @@ def orders(ground: Env, config: Config, executor: OptionExecutor, key: Array) ->
     return {f"order_{name}": distance_correlation(x.option, x.way) for name, x in effects.items()}
 
 
-def reference_levels() -> dict[str, dict[str, float]]:
-    """Return the distance in m from each arena's goal of whoever stands, or goes straight to it at 1 m/s."""
-    levels = {}
-    for name in ARENAS:
-        env: Any = make_env(name, "mujoco")
-        seconds = env.dt * env.episode_length
-        levels[name] = {"stand": straight(env.arena, 0.0, seconds), "go straight": straight(env.arena, 1.0, seconds)}
-    return levels
+def reference_levels(arenas: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return a row each for the distance in m from an arena's goal of whoever stands, or goes to it at 1 m/s."""
+    rows = []
+    for name, env in arenas.items():
+        for level, speed in (("stand", 0.0), ("go straight", 1.0)):
+            distance = straight(env.arena, speed, env.dt * env.episode_length)
+            rows.append({"run": level, "measure": f"{name}/final_distance", "iqm": distance})
+    return rows
 
 
 def write_measures(arguments: Arguments) -> None:
     """Measure the runs, and write the rows."""
     if not arguments.runs:
         raise ConfigError("expected the folder of at least one run, got none")
-    rows = []
+    rows, arenas = [], {}
     for folder in arguments.runs:
         for name, values in navigation_of(folder, arguments.picture).items():
             row = {"run": "/".join(folder.parts[-2:]), "seeds": len(values), "measure": name}
             rows.append(row | with_interval(values) | {"per_seed": values})
-    for name, levels in reference_levels().items():
-        rows += [{"run": level, "measure": f"{name}/final_distance", "iqm": x} for level, x in levels.items()]
+        arenas |= ground_and_arenas(*executors_of(folder)[:2])[1]
+    rows += reference_levels(arenas)
     write_numbers(rows, arguments.out, ("run", "seeds", "measure", "iqm", "low", "high", "per_seed"))
 
 
