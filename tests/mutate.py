@@ -27,7 +27,7 @@ TESTS = {
     "learning": "rl/test_learning.py options/test_losses.py options/test_algorithm_1.py",
     "ant_tasks": "envs/test_arenas.py envs/test_envs_rendering.py", "evaluate": "test_trainer.py",
     "summary": "test_dry_run.py test_transfer.py test_pipeline.py test_nonfinite.py handles/test_load.py",
-    "agent": "handles/test_load.py",
+    "agent": "handles/test_load.py", "off_policy": "rl/test_sac.py rl/test_dqn.py",
     "agents": "handles/test_load.py artifacts/test_artifacts.py", "play": "handles/test_commands.py",
     "assess": "handles/test_commands.py", "command": "handles/test_commands.py",
 }  # fmt: skip
