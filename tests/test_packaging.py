@@ -75,8 +75,11 @@ def built(tmp_path_factory) -> Path:
     return copy / "dist"
 
 
+MEASURING = tuple(f"taic_jax/experiments/{name}/" for name in ("benchmark", "evidence", "figures", "reliability"))
+
+
 def shipped() -> set[str]:
-    """List what must be inside: every module under its import name, and the data files."""
+    """List what must be inside: every module for users under its import name, and the data files."""
     files = set()
     for path in ROOT.glob("taic_jax/**/*.py"):
         files.add(path.relative_to(ROOT).as_posix())
@@ -87,6 +90,7 @@ def shipped() -> set[str]:
     pretrained = (path for path in ROOT.glob("experiments/pretrained/**/*") if path.is_file())
     files |= {f"taic_jax/{path.relative_to(ROOT).as_posix()}" for path in pretrained}
     page = [path for ending in ("html", "css", "js") for path in ROOT.glob(f"taic_jax/report/*.{ending}")]
+    files = {name for name in files if not name.startswith(MEASURING)}
     return files | {"taic_jax/py.typed"} | {path.relative_to(ROOT).as_posix() for path in page}
 
 
@@ -94,6 +98,7 @@ def test_wheel_holds_everything_and_nothing_else(built):
     (wheel,) = built.glob("*.whl")
     names = {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}
     assert names == shipped()
+    assert wheel.stat().st_size < 5e6
 
 
 def test_sdist_holds_everything(built):

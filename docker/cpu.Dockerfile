@@ -1,0 +1,12 @@
+# On a CPU:  docker build -f docker/cpu.Dockerfile -t taic . && docker run --rm -v "$PWD/runs:/work/runs" taic run nav2d
+FROM python:3.11-slim
+WORKDIR /src
+COPY pyproject.toml constraints.txt README.md LICENSE ./
+COPY taic_jax taic_jax
+COPY envs envs
+COPY experiments experiments
+RUN pip install --no-cache-dir -c constraints.txt '.[gym,data,viz]'
+# Films are drawn without a display.
+RUN apt-get update && apt-get install -y --no-install-recommends libegl1 libgl1 && rm -rf /var/lib/apt/lists/*
+WORKDIR /work
+ENTRYPOINT ["taic"]
