@@ -23,6 +23,8 @@ COMMANDS = {
     "envs": ("handles.pictures", "draw every task"),
     "completion": ("handles.completion", "print a script that completes this command in bash, zsh or tcsh"),
 }
+BARE = {"presets": "taic presets", "completion": "taic completion bash|zsh|tcsh"}
+"""Commands without options, and their usage."""
 HELP = """usage: taic COMMAND ...
 
 {}
@@ -38,6 +40,8 @@ def main(args: Sequence[str] | None = None) -> int:
     name, rest = (args[0], args[1:]) if args else ("--help", [])
     if name not in COMMANDS:
         return tell(lambda: _about(name))
+    if name in BARE and rest in (["-h"], ["--help"]):
+        return tell(lambda: print(f"usage: {BARE[name]}\n\n{COMMANDS[name][1]}"))
     module = importlib.import_module(f"taic_jax.{COMMANDS[name][0]}")
     if name == "completion":
         names = "run", "learn", "sweep", "report"

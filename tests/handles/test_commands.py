@@ -14,7 +14,7 @@ from PIL import Image
 from tiny_runs import CONFIG, files_of, with_fields
 
 import taic_jax as taic
-from taic_jax.__main__ import COMMANDS, main
+from taic_jax.__main__ import BARE, COMMANDS, main
 from taic_jax.command_line import COMMON_FIELDS
 from taic_jax.config.files import preset_names
 from taic_jax.envs.locomotion import Locomotion
@@ -162,10 +162,12 @@ def test_the_help_lists_every_command_and_each_has_its_own(capsys):
     assert main([]) == main(["--help"]) == 0
     out = capsys.readouterr().out
     assert all(f"  {name} " in out for name in COMMANDS)
-    for name in set(COMMANDS) - {"presets", "completion"}:
+    for name in set(COMMANDS) - set(BARE):
         with pytest.raises(SystemExit) as stop:
             main([name, "--help"])
         assert stop.value.code == 0 and "--" in capsys.readouterr().out
+    for name in BARE:
+        assert main([name, "--help"]) == 0 and capsys.readouterr().out.startswith(f"usage: taic {name}")
 
 
 def test_the_help_and_the_version_answer_without_jax():
