@@ -133,3 +133,10 @@ def test_a_relabelled_transition_has_the_rewards_for_the_goal_achieved_later():
     got = relabelled(batch, batch.replace(ticks=jnp.full(1, 2.0)))  # its own second tick, which ends it
     np.testing.assert_allclose(got.reward, [-10.0], rtol=1e-5)
     assert got.discount == 0.0 and got.option == 0.5
+
+
+def test_a_row_has_the_numbers_that_plans_of_memory_count():
+    observation_size, option_size, length, goal_size = 5, 2, 3, 4
+    pending = replay.init_pending(B, observation_size, option_size, length, goal_size)
+    size = replay.row_size(observation_size, option_size, length, goal_size)
+    assert replay.init(30, pending).rows.shape == (B, 10, size)
