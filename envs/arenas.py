@@ -180,6 +180,8 @@ def enclose(spec: mujoco.MjSpec, mass: float) -> None:
     sides = [((x, 0.0, 0.0), (thin, wide, high)) for x in (away, -away)]
     sides += [((0.0, y, 0.0), (wide, thin, high)) for y in (away, -away)]
     _add_movable(spec, "fence", (0.0, 0.0, high), (_FREE_X, _FREE_Y), sides, mass)
+    for geom in spec.body("fence").geoms:
+        geom.rgba[3] = 0.2  # or it hides the robot
 
 
 def _add_movable(

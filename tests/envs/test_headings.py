@@ -80,6 +80,13 @@ def test_a_fence_goes_with_the_ant_in_half_of_the_episodes(walk):
     np.testing.assert_array_equal(fence[:, ~fenced], FAR)
 
 
+def test_the_fence_hides_nothing(walk):
+    env, _, first, _ = walk
+    fenced = int(np.argmax(np.asarray(first.physics.qpos[:, 15]) == 0.0))
+    (frame,) = env.render(jax.tree.map(lambda x: x[fenced : fenced + 1], first.physics), height=60, width=80)
+    assert frame.std(axis=(0, 1)).min() > 15, "one colour: the camera stands outside the fence"
+
+
 def test_the_cheetah_is_paid_for_going_forward_or_backward_as_it_is_told():
     """Its reward is half_cheetah's, with the sign of the speed that the observation's last entry has."""
     env, plain = make_env("half_cheetah_headings", "mujoco"), make_env("half_cheetah", "mujoco")
