@@ -12,6 +12,11 @@ FOLDER = Path(__file__).parents[1] / "docs/notebooks"
 SMALL = {"TICKS, NEAR": "60, 3.0", "TRAINING": "14_000", "EPISODES, STEPS": "3, 30"}
 
 
+def test_every_small_budget_is_of_a_notebook():
+    text = "".join(path.read_text() for path in FOLDER.glob("*.py"))
+    assert all(f"\n{name} = " in text for name in SMALL)
+
+
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize("path", sorted(FOLDER.glob("*.py")), ids=lambda path: path.stem)
 def test_a_notebook_runs(path, tmp_path):

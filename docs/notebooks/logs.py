@@ -2,7 +2,7 @@
 # # Skills from your own logs
 #
 # Options can be learnt from recorded episodes alone: no simulator, no task. Here the log is made with Gymnasium's
-# pendulum, by a controller that swings it up; put your own file in its place.
+# pendulum, by a simple controller; put your own file in its place.
 
 # %%
 # In Colab, with a GPU: Runtime, Change runtime type, then

@@ -67,13 +67,12 @@ for axes, frame in zip(panels, frames, strict=True):
 # %% [markdown]
 # ## Learn it
 #
-# A policy over the same options learns by soft actor-critic with hindsight. The whole run has a million ticks, ten
-# minutes on a core; here are some, enough to see that it runs.
+# A policy over the same options learns by soft actor-critic with hindsight. The whole run has a million ticks; here
+# are some, enough to see that it runs.
 
 # %%
 TRAINING = 64_000
 config = taic.load_config("transfer_ant_maze")
-executor = taic.make_executor(run.config.options, run.options[0])
 env = taic.make_env("ant_maze", goal="mixed")
 agent, metrics = taic.train(config.train.sac, env, executor, jax.random.key(0), ticks=TRAINING)
 plt.figure(figsize=(4, 3))

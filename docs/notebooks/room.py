@@ -68,7 +68,7 @@ plt.axis("equal")
 # %% [markdown]
 # ## One entry at a time
 #
-# The KL term of learning leaves only as many entries in use as it takes: the others move nothing.
+# The KL term of learning leaves only as many entries in use as it takes: the others move little.
 
 # %%
 figure, panels = plt.subplots(1, options.size, figsize=(2.2 * options.size, 2.4), sharex=True, sharey=True)

@@ -16,9 +16,7 @@ include_patterns = ["docs/*.md", "docs/site/*.md", "README.md", "RESULTS.md", "C
 include_patterns += ["SECURITY.md", "experiments/README.md", "experiments/logbook.md", "experiments/results/options.md"]
 myst_heading_anchors = 3
 autodoc_member_order = "bysource"
-autodoc_typehints = (
-    "none"  # a signature with the shape of every array is longer than its page is wide; its text has them
-)
+autodoc_typehints = "none"  # signatures with the shape of every array are wider than the page
 html_theme, html_title = "furo", "taic_jax"
 
 

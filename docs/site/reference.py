@@ -7,13 +7,12 @@ import os
 import re
 import subprocess
 import sys
-import typing
-from collections.abc import Callable, Iterator
-from functools import partial
+from collections.abc import Callable
+from functools import partial, reduce
 
 import taic_jax
 from taic_jax.__main__ import COMMANDS
-from taic_jax.config import Config
+from taic_jax.config import Config, field_types
 
 
 def public_names() -> str:
@@ -41,20 +40,11 @@ def without_defaults(app, what: str, name: str, value, options, signature: str, 
 def config_fields() -> str:
     """Return a table of every field of the config by its dotted name, with its default and its help."""
     rows = ["| field | default | |", "|---|---|---|"]
-    rows += [f"| `{name}` | `{default!r}` | {text} |" for name, default, text in fields_of(Config, "")]
+    for name in field_types(Config):
+        *groups, field = name.split(".")
+        group = reduce(getattr, groups, Config())
+        rows.append(f"| `{name}` | `{getattr(group, field)!r}` | {texts_of(type(group)).get(field, '')} |")
     return "\n".join(rows)
-
-
-def fields_of(kind: type, prefix: str) -> Iterator[tuple[str, object, str]]:
-    """Yield name, default and help of the fields of a group, and of the groups in it."""
-    types, texts = typing.get_type_hints(kind), texts_of(kind)
-    for field in dataclasses.fields(kind):
-        if dataclasses.is_dataclass(group := types[field.name]):
-            yield from fields_of(group, f"{prefix}{field.name}.")
-        else:
-            factory = field.default_factory
-            default = field.default if factory is dataclasses.MISSING else factory()
-            yield prefix + field.name, default, texts.get(field.name, "")
 
 
 def texts_of(kind: type) -> dict[str, str]:

@@ -7,7 +7,7 @@ Writes a row per run and measure, see `navigate`; a picture shows the codes and 
 
 import dataclasses
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -101,10 +101,11 @@ def orders(ground: Env, config: Config, executor: OptionExecutor, key: Array) ->
     return {f"order_{name}": distance_correlation(x.option, x.way) for name, x in effects.items()}
 
 
-def reference_levels(arenas: Mapping[str, Any]) -> list[dict[str, Any]]:
+def reference_levels(names: Iterable[str]) -> list[dict[str, Any]]:
     """Return a row each for the distance in m from an arena's goal of whoever stands, or goes to it at 1 m/s."""
     rows = []
-    for name, env in arenas.items():
+    for name in names:
+        env: Any = make_env(name, "mujoco")
         for level, speed in (("stand", 0.0), ("go straight", 1.0)):
             distance = straight(env.arena, speed, env.dt * env.episode_length)
             rows.append({"run": level, "measure": f"{name}/final_distance", "iqm": distance})
@@ -115,13 +116,13 @@ def write_measures(arguments: Arguments) -> None:
     """Measure the runs, and write the rows."""
     if not arguments.runs:
         raise ConfigError("expected the folder of at least one run, got none")
-    rows, arenas = [], {}
+    rows: list[dict[str, Any]] = []
     for folder in arguments.runs:
         for name, values in navigation_of(folder, arguments.picture).items():
             row = {"run": "/".join(folder.parts[-2:]), "seeds": len(values), "measure": name}
             rows.append(row | with_interval(values) | {"per_seed": values})
-        arenas |= ground_and_arenas(*executors_of(folder)[:2])[1]
-    rows += reference_levels(arenas)
+    arenas = dict.fromkeys(row["measure"].rpartition("/")[0] for row in rows)  # a set in their order
+    rows += reference_levels(name for name in arenas if name != "codes")
     write_numbers(rows, arguments.out, ("run", "seeds", "measure", "iqm", "low", "high", "per_seed"))
 
 
