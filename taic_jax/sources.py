@@ -20,6 +20,7 @@ from taic_jax.config import (
     impossible,
     settings_of,
 )
+from taic_jax.config.base import CONTINUOUS, DISCRETE
 from taic_jax.envs import environment_options, make_env
 from taic_jax.envs.base import Env
 from taic_jax.envs.errors import UnknownNameError
@@ -78,7 +79,7 @@ def check_sides(config: Config, source: Env | Body) -> None:
 
 def _check_actions(config: Config, env: Env, source: Env) -> None:
     """Raise ConfigError for what does not fit the kind of actions: a flat learner, or noise on D's actions."""
-    if config.collect.learner == ("sac" if source.discrete else "dqn"):
+    if config.collect.learner in (CONTINUOUS if source.discrete else DISCRETE):
         kind, nearest = ("discrete", "dqn") if source.discrete else ("continuous", "sac")
         expected = f"ppo or {nearest} for {kind} actions, as of {source.name}"
         raise impossible("collect.learner", config.collect.learner, expected, nearest)

@@ -3,16 +3,20 @@
 import ast
 import dataclasses
 import inspect
+import math
 import os
 import re
 import subprocess
 import sys
 from collections.abc import Callable
 from functools import partial, reduce
+from typing import Annotated, Any, Literal, get_args, get_origin
 
 import taic_jax
 from taic_jax.__main__ import COMMANDS
-from taic_jax.config import Config, field_types
+from taic_jax.config import USUAL_BOUNDS, Bounds, Config, field_types
+
+ANY = Bounds(-math.inf)
 
 
 def public_names() -> str:
@@ -38,13 +42,25 @@ def without_defaults(app, what: str, name: str, value, options, signature: str, 
 
 
 def config_fields() -> str:
-    """Return a table of every field of the config by its dotted name, with its default and its help."""
-    rows = ["| field | default | |", "|---|---|---|"]
-    for name in field_types(Config):
+    """Return a table of every field of the config by its dotted name: its values, its default and its help."""
+    rows = ["| field | values | default | |", "|---|---|---|---|"]
+    for name, kind in field_types(Config, bounds=True).items():
         *groups, field = name.split(".")
         group = reduce(getattr, groups, Config())
-        rows.append(f"| `{name}` | `{getattr(group, field)!r}` | {texts_of(type(group)).get(field, '')} |")
+        cells = values_of(kind), f"`{getattr(group, field)!r}`", texts_of(type(group)).get(field, "")
+        rows.append(f"| `{name}` | {' | '.join(cells)} |")
     return "\n".join(rows)
+
+
+def values_of(kind: Any) -> str:
+    """Return the values that a field of this type may hold."""
+    bare, bounds = get_args(kind) if get_origin(kind) is Annotated else (kind, USUAL_BOUNDS.get(kind, ANY))
+    several = get_origin(bare) is tuple
+    bare = get_args(bare)[0] if several else bare
+    names = get_args(bare) if get_origin(bare) is Literal else (bare.__name__,)
+    text = ("several of " if several else "") + ", ".join(f"`{name}`" for name in names)
+    text += f" from {bounds.low:g}" if bounds.low > -math.inf else ""
+    return text + (f" to {bounds.high:.10g}" if bounds.high < math.inf else "")
 
 
 def texts_of(kind: type) -> dict[str, str]:

@@ -63,7 +63,7 @@ def numbers(runs: EvidenceRows, methods: Methods) -> Rows:
         row |= {"jump_start": float(np.mean(jump)), "jump_starts_positive": f"{(jump > 0).sum()}/{len(jump)}"}
         row |= with_improvement("improvement", last, flat.numbers["last"])
         row |= with_improvement("improvement_of_means", means, flat.numbers["mean_option"])
-        row["p"] = float(stats.mannwhitneyu(last, flat.numbers["last"], alternative="greater").pvalue)
+        row["p"] = float(stats.mannwhitneyu(means, flat.numbers["mean_option"], alternative="greater").pvalue)
     if "weak" in methods and runs.method not in (BASELINE, "weak"):
         row["improvement_on_weak"] = probability_of_improvement(last, methods["weak"].numbers["last"])[0]
     long = methods.get("long")

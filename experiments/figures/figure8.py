@@ -79,7 +79,7 @@ def numbers(runs: EvidenceRows, methods: Methods) -> Rows:
             if name != runs.method:
                 row |= with_improvement(f"improvement_on_{name}", sign * values, sign * other[measure])
         baselines = [others[name][measure] for name in BASELINES if name in others]
-        if measure == "last" and runs.method not in BASELINES and baselines:
+        if measure == "mean_option" and runs.method not in BASELINES and baselines:
             row["p"] = max(stats.mannwhitneyu(values, x, alternative="greater").pvalue for x in baselines)
         rows.append(row)
     return rows

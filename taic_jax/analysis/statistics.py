@@ -32,9 +32,16 @@ def bootstrap_interval(values: ArrayLike, seed: int = 0, confidence: float = 0.9
 
 
 def probability_of_improvement(x: ArrayLike, y: ArrayLike, seed: int = 0) -> tuple[float, tuple[float, float]]:
-    """Return P(a run of x [K] beats a run of y [J]), ties counted half, and its 95 % bootstrap interval over seeds."""
+    """Return P(a run of x [K] beats a run of y [J]), ties counted half, and its 95 % interval.
+
+    That is the bootstrap's over seeds. If all pairs agree, every resample does: then it is the exact one of min(K, J)
+    pairs without a common seed, which are independent.
+    """
     x, y = np.asarray(x, np.float64), np.asarray(y, np.float64)
     wins = np.sign(x[:, None] - y[None]) / 2 + 0.5
+    if wins.min() == wins.max() != 0.5:
+        pairs = min(wins.shape)
+        return float(wins.mean()), exact_interval(int(wins[0, 0]) * pairs, pairs)
     random = np.random.default_rng(seed)
     rows, columns = _resamples(random, len(x)), _resamples(random, len(y))
     draws = [wins[np.ix_(i, j)].mean() for i, j in zip(rows, columns, strict=True)]

@@ -30,6 +30,8 @@ Positive = Annotated[float, Bounds(TINY)]
 Share = Annotated[float, Bounds(0, 1)]
 LogStd = Annotated[float, Bounds(-20, 2)]
 Learner = Literal["ppo", "sac", "dqn"]
+CONTINUOUS, DISCRETE = ("sac",), ("dqn",)
+"""Learners of continuous options or actions alone, and of discrete ones alone."""
 Shard = Literal["auto", "none", "seeds", "envs"]
 Track = Literal["none", "wandb", "trackio"]
 """The axis to split over devices, and a tracker; no parts of an experiment, but needed without JAX."""

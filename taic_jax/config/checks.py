@@ -5,6 +5,7 @@ from operator import ge, le
 from typing import Annotated, Any, get_args, get_origin
 
 from taic_jax.config import USUAL_BOUNDS, Config, SACConfig, field_types, impossible, walk
+from taic_jax.config.base import CONTINUOUS, DISCRETE
 
 REPLAYS = ("collect.sac", "collect.dqn", "practise.sac", "train.sac", "train.dqn")
 
@@ -67,7 +68,7 @@ def _check_steering(config: Config) -> None:
 def _check_learners(config: Config) -> None:
     """Check that each learner does all that is asked of it, and that the rounds of replay divide an iteration."""
     train, flat, codes = config.train, config.collect.learner, config.options.codes
-    if train.learner == ("sac" if codes else "dqn"):
+    if train.learner in (CONTINUOUS if codes else DISCRETE):
         kind = f"with options.codes = {codes} ppo or dqn" if codes else "with options.codes = 0 ppo or sac"
         raise impossible("train.learner", train.learner, kind, "dqn" if codes else "sac")
     if codes == 1:

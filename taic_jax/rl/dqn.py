@@ -46,8 +46,16 @@ def update(
     config: DQNConfig, executor: Executor, learnt: Learnt, batch: Transition, key: Key[Array, ""]
 ) -> tuple[Learnt, Float[Array, "3"]]:
     """Take one gradient step on M transitions of normalised observations; return the terms of the loss."""
+    target = double_target(learnt.policy.values, make_policy(executor, config), learnt.targets, batch)
+    return step_towards(config, executor, learnt, batch, target)
+
+
+def step_towards(
+    config: DQNConfig, executor: Executor, learnt: Learnt, batch: Transition, target: Float[Array, " M"]
+) -> tuple[Learnt, Float[Array, "3"]]:
+    """Bring the values of the chosen options one gradient step nearer to their targets."""
     values, epsilon = learnt.policy.values, learnt.policy.epsilon
-    gradient, terms = jax.grad(dqn_loss, has_aux=True)(values, make_policy(executor, config), learnt.targets, batch)
+    gradient, terms = jax.grad(dqn_loss, has_aux=True)(values, make_policy(executor, config), batch, target)
     values, optimizer = descend(config, gradient, values, learnt.optimizer)
     fallen = jnp.maximum(epsilon - (1.0 - config.epsilon) / config.epsilon_steps, config.epsilon)
     targets = follow(config, learnt.targets, values)
@@ -55,11 +63,11 @@ def update(
 
 
 def dqn_loss(
-    values: Any, policy: GreedyPolicy, targets: Any, batch: Transition
+    values: Any, policy: GreedyPolicy, batch: Transition, target: Float[Array, " M"]
 ) -> tuple[Float[Array, ""], Float[Array, "2"]]:
-    """Return the mean squared error of the values of the chosen options [M], and the mean value."""
+    """Return the mean squared error of the values of the chosen options, and the mean value."""
     chosen = jnp.sum(policy.evaluate(values, batch.obs) * batch.option, axis=-1)
-    loss = jnp.mean(jnp.square(chosen - jax.lax.stop_gradient(double_target(values, policy, targets, batch))))
+    loss = jnp.mean(jnp.square(chosen - target))
     return loss, jnp.stack([loss, jnp.mean(chosen)])
 
 

@@ -81,7 +81,9 @@ def test_probability_of_improvement_by_hand():
     # Of nine pairs, 1 beats 0, 3 beats all three, 2 beats two and ties with 2: (1 + 3 + 2 + 1/2) / 9.
     share, (low, high) = probability_of_improvement([1, 3, 2], [0, 2, 1.5])
     assert share == pytest.approx((1 + 3 + 2 + 0.5) / 9) and low < share < high
-    assert probability_of_improvement([2, 3], [0, 1]) == (1.0, (1.0, 1.0))
+    # Two pairs without a common seed: 0.025 = p ** 2 at the lower bound.
+    assert probability_of_improvement([2, 3, 4], [0, 1]) == (1.0, (pytest.approx(0.025**0.5), 1.0))
+    assert probability_of_improvement([0, 1], [2, 3, 4]) == (0.0, (0.0, pytest.approx(1 - 0.025**0.5)))
     assert probability_of_improvement([1, 1], [1, 1])[0] == 0.5
 
 

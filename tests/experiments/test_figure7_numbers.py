@@ -37,6 +37,7 @@ def test_numbers_by_hand():
     # Last, 25, 9, 30 against 10, 20, 30: 2, 0, 2.5 of 3. Means, 31, 32, 9: 3, 3, 0.
     assert row["improvement"] == pytest.approx(4.5 / 9) and row["improvement_of_means"] == pytest.approx(6 / 9)
     assert row["improvement_low"] < row["improvement"] < row["improvement_high"]
+    assert row["p"] == pytest.approx(7 / 20), "of the 20 orders of both methods' means, 7 have as many wins"
     assert {"improvement_on_weak", "improvement_at_same_total"}.isdisjoint(row)
 
 

@@ -136,9 +136,12 @@ def test_the_target_is_double_and_semi_markov(learnt):
         chosen = policy.evaluate(values, batch.obs)[np.arange(M), np.argmax(batch.option, axis=1)]
         return jnp.mean(jnp.square(chosen - target))
 
-    got, terms = jax.grad(dqn.dqn_loss, has_aux=True)(learnt.policy.values, policy, learnt.targets, batch)
+    got, terms = jax.grad(dqn.dqn_loss, has_aux=True)(learnt.policy.values, policy, batch, target)
     for x, y in zip(jax.tree.leaves(got), jax.tree.leaves(jax.grad(loss)(learnt.policy.values)), strict=True):
         np.testing.assert_allclose(x, y, rtol=1e-3, atol=1e-5)
+    np.testing.assert_allclose(terms[0], loss(learnt.policy.values), rtol=1e-4)
+    config = as_arrays(dataclasses.replace(CONFIG, hidden_sizes=(4,)))
+    _, terms = dqn.update(config, IdentityExecutor(D, discrete=True), learnt, batch, jax.random.key(0))
     np.testing.assert_allclose(terms[0], loss(learnt.policy.values), rtol=1e-4)
 
 
