@@ -44,12 +44,12 @@ def starts(task: str) -> dict[str, float]:
 
 def _next_iteration(task: str, folder: Path, run_dir: Path, *options: str) -> float:
     """Start a run whose cache is in the folder, stop it after the next row of its metrics, and return the seconds."""
-    environment = {key: value for key, value in os.environ.items() if not key.startswith("JAX_COMPILATION_CACHE")}
-    environment |= {"XDG_CACHE_HOME": str(folder / "cache")}
     command = [sys.executable, "-m", "taic_jax.run", task, "--run-dir", str(run_dir), *options]
     run = RunFolder(run_dir)
     before, begun = len(run.metrics()), time.perf_counter()
-    with subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+    with subprocess.Popen(
+        command, env=cache_in(folder / "cache"), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    ) as process:
         try:
             while len(run.metrics()) <= before:
                 if process.poll() is not None or time.perf_counter() - begun > PATIENCE:
@@ -58,6 +58,12 @@ def _next_iteration(task: str, folder: Path, run_dir: Path, *options: str) -> fl
             return time.perf_counter() - begun
         finally:
             process.terminate()
+
+
+def cache_in(folder: Path) -> dict[str, str]:
+    """Return the environment of a process that keeps its compiled programs in this folder."""
+    others = {key: value for key, value in os.environ.items() if not key.startswith("JAX_COMPILATION_CACHE")}
+    return others | {"XDG_CACHE_HOME": str(folder)}
 
 
 class SeedsApart:

@@ -101,32 +101,37 @@ def adjust(rows: Rows) -> None:
 
 
 class Strip(NamedTuple):
-    """A row of panels: its curve, and whether the ticks of pre-training count."""
+    """A panel: its curve, the number whose interquartile mean is a dot at the end, the label of its axis, and whether
+    the ticks of pre-training count."""
 
     curve: str = "return"
+    end: str = "mean_option"
+    label: str = "return of an episode"
     pretrained: bool = False
 
 
 def draw_panels(
     panels: dict[str, Methods],
-    strips: Sequence[Strip],
+    strips: Sequence[Sequence[Strip]],
     styles: Sequence[Mapping[str, Style]],
     height: float,
     ncols: int,
 ) -> tuple[Picture, np.ndarray]:
     """Draw a column per task and a row per strip above a legend of `ncols` columns; return the figure and its axes.
 
-    `styles` are those of each task's methods. Remarks on missing or mixed rows stand below a task's name.
+    `strips` and `styles` are those of each task, the latter by method. Remarks on missing or mixed rows stand below a
+    task's name.
     """
-    figure, grid = plt.subplots(len(strips), len(panels), figsize=(4.1 * len(panels) + 0.4, height), squeeze=False)
+    figure, grid = plt.subplots(len(strips[0]), len(panels), figsize=(4.1 * len(panels) + 0.4, height), squeeze=False)
     for column, (task, methods) in enumerate(panels.items()):
         own = styles[column]
-        for axes, strip in zip(grid[:, column], strips, strict=True):
+        for axes, strip in zip(grid[:, column], strips[column], strict=True):
             draw_strip(axes, strip, methods, own)
+            if not column or strip.label != strips[column - 1][0].label:
+                axes.set_ylabel(strip.label)
         remarks = [f"{own[name][1]}: {remark}" for name, runs in methods.items() for remark in runs.remarks]
         missing = [label for name, (_, label, _) in own.items() if name not in methods]
         mark(grid[0, column], task, remarks + (["missing: " + ", ".join(missing)] if missing else []))
-    grid[0, 0].set_ylabel("return of an episode")
     curves = {x: y for axes in grid[0] for y, x in zip(*axes.get_legend_handles_labels(), strict=True)}
     figure.legend(curves.values(), curves.keys(), loc="outside lower center", ncols=ncols, title=LEGEND)
     return figure, grid
@@ -137,8 +142,7 @@ def draw_strip(axes: Axes, strip: Strip, methods: Methods, styles: Mapping[str, 
     curves = {name: runs for name, runs in methods.items() if strip.curve in runs.curves}
     for name, runs in curves.items():
         ticks = runs.grid + (runs.pretraining if strip.pretrained else 0)
-        ends = runs.numbers["mean_option"] if strip.curve == "return" else None
-        draw_curves(axes, ticks, runs.curves[strip.curve], styles[name], ends)
+        draw_curves(axes, ticks, runs.curves[strip.curve], styles[name], runs.numbers[strip.end])
     if curves:
         axes.set_xlim(left=0)
         unit, letter = (1e6, "M") if axes.get_xlim()[1] > 1e6 else (1e3, "k")
@@ -153,9 +157,9 @@ def draw_strip(axes: Axes, strip: Strip, methods: Methods, styles: Mapping[str, 
         axes.text(0.5, 0.5, "no finished runs", transform=axes.transAxes, ha="center", color=WARNING)
 
 
-def draw_curves(axes: Axes, ticks: np.ndarray, values: np.ndarray, style: Style, ends: np.ndarray | None) -> None:
+def draw_curves(axes: Axes, ticks: np.ndarray, values: np.ndarray, style: Style, ends: np.ndarray) -> None:
     """Draw every seed [K, G] as a thin line, their interquartile mean as a thick one with its 95 % interval, and a dot
-    at that of the returns `ends` [K] of mean actions or options."""
+    at that of the numbers `ends` [K]."""
     colour, label, dashed = style
     axes.plot(ticks, values.T, color=colour, linewidth=0.5, alpha=0.3)
     mean, line = iqm(values, axis=0), "--" if dashed else "-"
@@ -163,8 +167,7 @@ def draw_curves(axes: Axes, ticks: np.ndarray, values: np.ndarray, style: Style,
     if len(values) > 1:
         low, high = stratified_interval([values])
         axes.fill_between(ticks, low, high, color=colour, alpha=0.18, linewidth=0, zorder=2)
-    if ends is not None:
-        axes.plot(ticks[-1], iqm(ends), "o", color=colour, markeredgecolor="white", markersize=7, zorder=4)
+    axes.plot(ticks[-1], iqm(ends), "o", color=colour, markeredgecolor="white", markersize=7, zorder=4)
 
 
 def mark(axes: Axes, title: str, remarks: Sequence[str], width: int = 52) -> None:

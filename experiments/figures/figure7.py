@@ -76,6 +76,5 @@ def numbers(runs: EvidenceRows, methods: Methods) -> Rows:
 def picture(panels: dict[str, Methods], methods: Sequence[str]) -> Picture:
     """Draw a column per task: over the task's ticks alone, and over these and the ticks of pre-training."""
     styles = {name: (COLOURS[name], METHODS[name][0], name in FLAT) for name in methods}
-    figure, grid = draw_panels(panels, (Strip(), Strip(pretrained=True)), [styles] * len(panels), 7.6, len(panels))
-    grid[1, 0].set_ylabel("return of an episode")
-    return figure
+    strips = (Strip(), Strip(pretrained=True))
+    return draw_panels(panels, [strips] * len(panels), [styles] * len(panels), 7.6, len(panels))[0]

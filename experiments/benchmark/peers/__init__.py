@@ -19,6 +19,8 @@ from taic_jax.experiments.benchmark.timing import seconds
 # Our own ant has no observations of contact forces (78 entries, all but zero); theirs leaves them out too.
 GYMNASIUM: dict[str, tuple[str, dict[str, Any]]] = {
     "half_cheetah": ("HalfCheetah-v5", {}),
+    "hopper": ("Hopper-v5", {}),
+    "walker2d": ("Walker2d-v5", {}),
     "ant": ("Ant-v5", {"include_cfrc_ext_in_observation": False, "contact_cost_weight": 0.0}),
 }
 ENVPOOL = {"half_cheetah": "HalfCheetah-v4", "ant": "Ant-v4"}

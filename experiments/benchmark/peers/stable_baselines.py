@@ -1,13 +1,38 @@
 """Stable-Baselines3's PPO on Gymnasium's environments; imports both, and PyTorch."""
 
+import time
+from collections.abc import Iterator
 from typing import Any
 
 import gymnasium
 import torch
 from stable_baselines3 import PPO
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from taic_jax.config import PPOConfig
+
+# PPO's settings of RL Baselines3 Zoo that are not the library's own, and the widths of its networks.
+_TUNED: dict[str, Any] = {
+    "policy_kwargs": {
+        "log_std_init": -2.0, "ortho_init": False, "activation_fn": torch.nn.ReLU,
+        "net_arch": {"pi": [256, 256], "vf": [256, 256]},
+    }
+}  # fmt: skip
+ZOO: dict[str, dict[str, Any]] = {
+    "half_cheetah": _TUNED | {
+        "batch_size": 64, "n_steps": 512, "gamma": 0.98, "learning_rate": 2.0633e-5, "ent_coef": 0.000401762,
+        "clip_range": 0.1, "n_epochs": 20, "gae_lambda": 0.92, "max_grad_norm": 0.8, "vf_coef": 0.58096,
+    },
+    "hopper": _TUNED | {
+        "batch_size": 32, "n_steps": 512, "gamma": 0.999, "learning_rate": 9.80828e-5, "ent_coef": 0.00229519,
+        "clip_range": 0.2, "n_epochs": 5, "gae_lambda": 0.99, "max_grad_norm": 0.7, "vf_coef": 0.835671,
+    },
+    "walker2d": {
+        "batch_size": 32, "n_steps": 512, "gamma": 0.99, "learning_rate": 5.05041e-5, "ent_coef": 0.000585045,
+        "clip_range": 0.1, "n_epochs": 20, "gae_lambda": 0.95, "max_grad_norm": 1.0, "vf_coef": 0.871923,
+    },
+    "ant": {},
+}  # fmt: skip
 
 
 class StableBaselines:
@@ -36,3 +61,32 @@ class StableBaselines:
     def close(self) -> None:
         """End the processes of its environments."""
         self._envs.close()
+
+
+def climb(
+    task: str, name: str, options: dict[str, Any], seed: int, *, ticks: int, every: int, episodes: int
+) -> Iterator[tuple[int, float, float]]:
+    """Train PPO with the zoo's settings, on normalised observations and rewards.
+
+    Yield the ticks so far, the return of mean actions, and the seconds of evaluation so far, after each `every` ticks.
+    """
+    torch.set_num_threads(1)  # PyTorch's own number is slower with networks of this size
+    settings, spent = ZOO[task], 0.0
+    trained = VecNormalize(DummyVecEnv([lambda: gymnasium.make(name, **options)]), gamma=settings.get("gamma", 0.99))
+    tested = gymnasium.make(name, **options)
+    model = PPO("MlpPolicy", trained, seed=seed, device="cpu", **settings)
+
+    def score(episode: int) -> float:
+        obs, total, ended = tested.reset(seed=episode)[0], 0.0, False
+        while not ended:
+            action = model.predict(trained.normalize_obs(obs), deterministic=True)[0]
+            obs, reward, terminated, truncated, _ = tested.step(action)
+            total, ended = total + float(reward), terminated or truncated
+        return total
+
+    while model.num_timesteps < ticks:
+        model.learn(every, reset_num_timesteps=False)
+        begun = time.perf_counter()
+        returned = sum(map(score, range(episodes))) / episodes
+        spent += time.perf_counter() - begun
+        yield model.num_timesteps, returned, spent
