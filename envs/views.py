@@ -19,7 +19,7 @@ class Views(struct.PyTreeNode):
     action_sign: Array
 
     def __len__(self) -> int:
-        """V."""
+        """V, the number of views."""
         return self.obs_order.shape[-2]
 
     def directions(self, direction: Float[Array, " 2"]) -> Float[Array, "V 2"]:

@@ -20,7 +20,7 @@ class Executor(Protocol):
 
     @property
     def option_size(self) -> int:
-        """D."""
+        """D, the numbers of an option."""
         ...
 
     @property

@@ -209,7 +209,7 @@ class OptionModel(struct.PyTreeNode):
 
     @property
     def state_size(self) -> int:
-        """P."""
+        """P, the numbers of the proprioceptive slice."""
         return self.state_scale.mean.shape[-1]
 
     @property

@@ -45,13 +45,13 @@ class Agent(struct.PyTreeNode):
 
     @property
     def observation_size(self) -> int:
-        """S."""
+        """S, the numbers of an observation."""
         mean: Any = self.obs_statistics.mean
         return mean.shape[-1]
 
     @property
     def action_size(self) -> int:
-        """A."""
+        """A, the numbers of an action."""
         obs = jnp.zeros(self.observation_size)
         shapes: Any = jax.eval_shape(lambda: self.act(self.start(obs), obs))
         return shapes[1].shape[-1]
