@@ -116,8 +116,8 @@ def draw_panels(
     styles: Sequence[Mapping[str, Style]],
     height: float,
     ncols: int,
-) -> tuple[Picture, np.ndarray]:
-    """Draw a column per task and a row per strip above a legend of `ncols` columns; return the figure and its axes.
+) -> Picture:
+    """Draw a column per task and a row per strip above a legend of `ncols` columns.
 
     `strips` and `styles` are those of each task, the latter by method. Remarks on missing or mixed rows stand below a
     task's name.
@@ -134,7 +134,7 @@ def draw_panels(
         mark(grid[0, column], task, remarks + (["missing: " + ", ".join(missing)] if missing else []))
     curves = {x: y for axes in grid[0] for y, x in zip(*axes.get_legend_handles_labels(), strict=True)}
     figure.legend(curves.values(), curves.keys(), loc="outside lower center", ncols=ncols, title=LEGEND)
-    return figure, grid
+    return figure
 
 
 def draw_strip(axes: Axes, strip: Strip, methods: Methods, styles: Mapping[str, Style]) -> None:

@@ -77,4 +77,4 @@ def picture(panels: dict[str, Methods], methods: Sequence[str]) -> Picture:
     """Draw a column per task: over the task's ticks alone, and over these and the ticks of pre-training."""
     styles = {name: (COLOURS[name], METHODS[name][0], name in FLAT) for name in methods}
     strips = (Strip(), Strip(pretrained=True))
-    return draw_panels(panels, [strips] * len(panels), [styles] * len(panels), 7.6, len(panels))[0]
+    return draw_panels(panels, [strips] * len(panels), [styles] * len(panels), 7.6, len(panels))

@@ -96,4 +96,4 @@ def picture(panels: dict[str, Methods]) -> Picture:
         {name: (COLOURS[name], label, name in BASELINES) for name, (label, _) in METHODS[task].items()}
         for task in panels
     ]
-    return draw_panels(panels, strips, styles, 4.4, min(3, 2 * len(panels) - 1))[0]
+    return draw_panels(panels, strips, styles, 4.4, min(3, 2 * len(panels) - 1))
